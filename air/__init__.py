@@ -1,0 +1,1 @@
+"""The aircraft: device bytes to a growing map. Never imports `ground`."""

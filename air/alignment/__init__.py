@@ -1,0 +1,1 @@
+"""Where each photo was taken: features, matching, bundle adjustment."""

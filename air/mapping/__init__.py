@@ -1,0 +1,1 @@
+"""From posed photos to map tiles: stereo, fusion, tiles."""

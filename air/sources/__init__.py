@@ -1,0 +1,1 @@
+"""Everything that can feed the aircraft, opened by URL."""

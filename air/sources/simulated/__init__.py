@@ -1,0 +1,1 @@
+"""The flight simulator: world, flight and camera apart."""

@@ -1,0 +1,1 @@
+"""What leaves the aircraft, in which order and how fast."""

@@ -1,0 +1,1 @@
+"""What aircraft and ground share: messages, wire, bus, geometry, products."""

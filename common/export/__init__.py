@@ -1,0 +1,1 @@
+"""Writers of standard files: point cloud, raster, mesh, trajectory."""

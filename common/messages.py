@@ -1,0 +1,164 @@
+"""What flows between the stages: frozen dataclasses in SI units and the frames of the design.
+
+`Message` names those that travel on streams; `Photo` is what a source gives to the aircraft's own cores.
+
+`world` is local ENU at the datum of the flight. `t_ns` is integer nanoseconds of GNSS time at the moment of
+sampling (mid-exposure for an image). Arrays are read-only by convention: whoever changes one copies it first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from common.arrays import F32, F64, I32, U8, Bool
+from common.camera import CameraModel
+from common.se3 import SE3
+
+
+@dataclass(frozen=True)
+class GnssFix:
+    """A position: degrees, metres above the WGS84 ellipsoid, one-sigma metres."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    sigma_horizontal: float
+    sigma_vertical: float
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """One still image of a camera, as its source gave it.
+
+    `jpeg` is the encoded file, maybe damaged. `camera` is a first guess or None when nothing is known.
+    `R_enu_cam` (3, 3) is the camera's attitude in local ENU with `attitude_sigma` rad, or None.
+    """
+
+    t_ns: int
+    name: str
+    jpeg: bytes
+    camera: CameraModel | None
+    fix: GnssFix | None
+    R_enu_cam: F64 | None = None
+    attitude_sigma: float = 0.0
+
+
+@dataclass(frozen=True)
+class Datum:
+    """Origin of the world frame of one flight: degrees, metres above the WGS84 ellipsoid.
+
+    `flight` names the flight (start time as text, so it sorts); every map message carries it.
+    """
+
+    flight: str
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+
+
+class Mode(StrEnum):
+    """How the aircraft's pose is known at the moment."""
+
+    INITIALIZING = "initializing"
+    PHOTOGRAMMETRIC = "photogrammetric"
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Pose of the aircraft: `T_world_body`, velocity (3,) m/s in world or None, position sigma (3,) m."""
+
+    flight: str
+    t_ns: int
+    revision: int
+    T_world_body: SE3
+    v_world: F64 | None
+    sigma: F64
+    mode: Mode
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A camera pose that the map is built from; a higher `revision` of the same `index` replaces it.
+
+    `T_world_cam` with position sigma (3,) m; `camera` as estimated at this revision; `thumbnail` is a small JPEG.
+    """
+
+    flight: str
+    index: int
+    revision: int
+    t_ns: int
+    name: str
+    T_world_cam: SE3
+    camera: CameraModel
+    sigma: F64
+    thumbnail: bytes
+
+
+@dataclass(frozen=True, order=True)
+class TileId:
+    """Place of a tile: cell size doubles per `level`; (x, y) counts tiles east and north of the datum."""
+
+    level: int
+    x: int
+    y: int
+
+
+@dataclass(frozen=True, eq=False)
+class MapTile:
+    """A square of N × N cells of the surface, row 0 at the south edge, column 0 at the west edge.
+
+    Cell (row, col) has its centre at east `(x·N + col + 0.5)·cell`, north `(y·N + row + 0.5)·cell`, both in world.
+    `height` (N, N) float32 m in world, NaN where unknown; `sigma` (N, N) float32 m; `colour` (N, N, 3) uint8 RGB;
+    `views` (N, N) uint8, how many photos agree on the height; `disputed` (N, N) bool, true where photos disagree.
+    """
+
+    flight: str
+    id: TileId
+    revision: int
+    t_ns: int
+    cell: float
+    height: F32
+    sigma: F32
+    colour: U8
+    views: U8
+    disputed: Bool
+
+
+@dataclass(frozen=True, eq=False)
+class MapDigest:
+    """Which tiles the sender holds: `tiles` (M, 4) int32, one row `level, x, y, revision` per tile, sorted."""
+
+    flight: str
+    t_ns: int
+    tiles: I32
+
+
+@dataclass(frozen=True, eq=False)
+class TileRequest:
+    """Asks the aircraft to send tiles again: `tiles` (M, 3) int32, one row `level, x, y` per tile."""
+
+    flight: str
+    tiles: I32
+
+
+class Level(StrEnum):
+    """How well a part of the system works."""
+
+    OK = "ok"
+    DEGRADED = "degraded"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Health:
+    """State of one process: its role, how well it works, one line for the operator, and named counts."""
+
+    t_ns: int
+    role: str
+    level: Level
+    text: str
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+Message = Datum | Pose | Keyframe | MapTile | MapDigest | TileRequest | Health

@@ -1,0 +1,72 @@
+"""The one table of streams. Publishers, subscribers, uplink, viewer and documentation all read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from common.messages import Datum, Health, Keyframe, MapDigest, MapTile, Message, Pose, TileRequest
+
+
+class Priority(Enum):
+    """Transport priority, from the most to the least urgent."""
+
+    REAL_TIME = auto()
+    DATA_HIGH = auto()
+    DATA = auto()
+    DATA_LOW = auto()
+    BACKGROUND = auto()
+
+
+class Congestion(Enum):
+    """What happens when the link is full: the message is dropped, or the sender waits."""
+
+    DROP = auto()
+    BLOCK = auto()
+
+
+class Radio(Enum):
+    """Which radios carry a stream: both, the fast video link alone, or the wires on board."""
+
+    BOTH = auto()
+    VIDEO = auto()
+    LOCAL = auto()
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One row of the table.
+
+    `rate_hz` is nominal (0: on change); `max_bytes` is refused above; a stream is stale after `stale_after_s`
+    without a message (0: never); `keyed` streams append chunks (a tile's place, a keyframe's index).
+    """
+
+    name: str
+    message: type[Message]
+    rate_hz: float
+    priority: Priority
+    congestion: Congestion
+    radio: Radio
+    max_bytes: int
+    stale_after_s: float
+    keyed: bool = False
+    express: bool = False
+
+
+POSE = Stream("pose", Pose, 10.0, Priority.REAL_TIME, Congestion.DROP, Radio.BOTH, 1_000, 1.0, express=True)
+DATUM = Stream("datum", Datum, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 1_000, 5.0)
+HEALTH = Stream(
+    "health", Health, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 5.0, keyed=True
+)
+DIGEST = Stream("map/digest", MapDigest, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 256_000, 5.0)
+KEYFRAME = Stream(
+    "keyframe", Keyframe, 0.0, Priority.DATA, Congestion.BLOCK, Radio.VIDEO, 64_000, 0.0, keyed=True
+)
+TILE = Stream(
+    "map/tile", MapTile, 0.0, Priority.DATA_LOW, Congestion.BLOCK, Radio.VIDEO, 256_000, 0.0, keyed=True
+)
+TILE_REQUEST = Stream(
+    "cmd/tiles", TileRequest, 0.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 64_000, 0.0
+)
+
+STREAMS: tuple[Stream, ...] = (POSE, DATUM, HEALTH, DIGEST, KEYFRAME, TILE, TILE_REQUEST)

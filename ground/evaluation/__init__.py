@@ -1,0 +1,1 @@
+"""Comparison of results with references: the tables of the papers."""

@@ -1,0 +1,1 @@
+"""The wire format as JSON Schema, one file per message and version."""
