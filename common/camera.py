@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import AnyFloat, F64
+from common.arrays import F64, AnyFloat
 
 
 @dataclass(frozen=True)

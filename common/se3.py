@@ -95,9 +95,16 @@ def rotation_vector_to_matrix(rotvec: F64) -> F64:
     return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K))
 
 
+def rotation_vector(R: F64) -> F64:
+    """Rotation vector (3,) rad, of length at most π, of a rotation matrix (3, 3)."""
+    w, *xyz = matrix_to_quaternion(R)
+    sine = float(np.linalg.norm(xyz))
+    return np.asarray(xyz) * (2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, w) / sine)
+
+
 def rotation_angle(R: F64) -> float:
     """Angle of a rotation matrix (3, 3), rad in [0, π]."""
-    return float(2 * np.arccos(np.clip(matrix_to_quaternion(R)[0], -1.0, 1.0)))
+    return float(np.linalg.norm(rotation_vector(R)))
 
 
 def skew(v: F64) -> F64:

@@ -55,18 +55,10 @@ class Stream:
 
 POSE = Stream("pose", Pose, 10.0, Priority.REAL_TIME, Congestion.DROP, Radio.BOTH, 1_000, 1.0, express=True)
 DATUM = Stream("datum", Datum, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 1_000, 5.0)
-HEALTH = Stream(
-    "health", Health, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 5.0, keyed=True
-)
+HEALTH = Stream("health", Health, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 5.0, keyed=True)
 DIGEST = Stream("map/digest", MapDigest, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 256_000, 5.0)
-KEYFRAME = Stream(
-    "keyframe", Keyframe, 0.0, Priority.DATA, Congestion.BLOCK, Radio.VIDEO, 64_000, 0.0, keyed=True
-)
-TILE = Stream(
-    "map/tile", MapTile, 0.0, Priority.DATA_LOW, Congestion.BLOCK, Radio.VIDEO, 256_000, 0.0, keyed=True
-)
-TILE_REQUEST = Stream(
-    "cmd/tiles", TileRequest, 0.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 64_000, 0.0
-)
+KEYFRAME = Stream("keyframe", Keyframe, 0.0, Priority.DATA, Congestion.BLOCK, Radio.VIDEO, 64_000, 0.0, keyed=True)
+TILE = Stream("map/tile", MapTile, 0.0, Priority.DATA_LOW, Congestion.BLOCK, Radio.VIDEO, 256_000, 0.0, keyed=True)
+TILE_REQUEST = Stream("cmd/tiles", TileRequest, 0.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 64_000, 0.0)
 
 STREAMS: tuple[Stream, ...] = (POSE, DATUM, HEALTH, DIGEST, KEYFRAME, TILE, TILE_REQUEST)

@@ -1,0 +1,396 @@
+"""Alignment: where each photo was taken, found photo by photo and improved with every further one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import cv2
+import numpy as np
+
+from air.alignment.bundle import PosePrior
+from air.alignment.geometry import relative_pose, triangulate_pair
+from air.alignment.georeference import georeference
+from air.alignment.matching import match
+from air.alignment.prepare import Features, PreparedPhoto
+from air.alignment.reconstruction import Reconstruction
+from air.alignment.settings import AlignmentSettings
+from common.arrays import F64, I64, U8
+from common.camera import CameraModel
+from common.geo import T_ecef_enu, geodetic_to_ecef
+from common.messages import Datum, GnssFix, Keyframe, Photo
+from common.se3 import SE3
+
+THUMBNAIL_PX = 320
+CALIBRATE_SPREAD = 0.15
+"""Extent of the block across its strips from which the intrinsics are adjusted: one strip leaves them undetermined."""
+FINAL_ROUNDS = 2
+LOCAL_FREE = 6
+LOCAL_FIXED = 12
+MIN_PAIR_ANGLE_DEG = 2.0
+
+
+class State(StrEnum):
+    """What became of a photo."""
+
+    PLACED = "placed"
+    WAITING = "waiting"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True)
+class PhotoStatus:
+    """What became of a photo, with the reason where it is not simply placed."""
+
+    name: str
+    state: State
+    reason: str
+
+
+@dataclass(eq=False)
+class _Entry:
+    photo: Photo
+    thumbnail: bytes
+    features: Features
+    p_ecef: F64 | None
+    revision: int = 0
+    published: tuple[SE3, CameraModel] | None = None
+
+
+class Alignment:
+    """Incremental alignment of photos (core: no clock, no file, no thread).
+
+    `add` takes prepared photos in any order and returns the keyframes that are new or have moved; `finish` adjusts
+    everything once more and returns what moved. Photos that fit nowhere wait, and are placed when others connect them.
+    """
+
+    def __init__(self, flight: str, settings: AlignmentSettings | None = None) -> None:
+        self.settings = settings or AlignmentSettings()
+        self.flight = flight
+        self.datum: Datum | None = None
+        self._entries: dict[int, _Entry] = {}
+        self._faults: dict[int, str] = {}
+        self._names: list[str] = []
+        self._digests: dict[bytes, str] = {}
+        self._matches: dict[tuple[int, int], I64] = {}
+        self._block = Reconstruction(self.settings)
+        self._adjusted = 0
+        self._components = 0
+
+    def add(self, prepared: PreparedPhoto) -> list[Keyframe]:
+        """Keyframes that are new or moved through one more photo."""
+        index = self._register(prepared)
+        if index is None:
+            return []
+        self._match(index)
+        self._grow()
+        return self._moved()
+
+    def finish(self) -> list[Keyframe]:
+        """Keyframes that moved in the final adjustment of all photos with all their observations."""
+        self._grow()
+        if self.datum is not None:
+            self._adjust_all(final=True)
+        return self._moved()
+
+    @property
+    def placed(self) -> int:
+        """How many photos have a pose."""
+        return len(self._block.poses)
+
+    @property
+    def cameras(self) -> list[CameraModel]:
+        """The cameras as estimated now."""
+        return list(self._block.cameras)
+
+    def residual_px(self) -> float:
+        """Root mean square of the reprojection errors, px of the full image."""
+        errors = self._block.residuals_px()
+        return float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+
+    def statuses(self) -> list[PhotoStatus]:
+        """What became of every photo, in the order of arrival."""
+        sizes = [len(self._block.photos(c)) for c in range(self._components)]
+        return [self._status(i, sizes) for i in range(len(self._names))]
+
+    def _status(self, i: int, sizes: list[int]) -> PhotoStatus:
+        name = self._names[i]
+        if i in self._faults:
+            return PhotoStatus(name, State.REJECTED, self._faults[i])
+        no_fix = self._entries[i].p_ecef is None
+        if i not in self._block.poses:
+            reason = "matches no photo that could be placed: another place, or too little overlap"
+            return PhotoStatus(name, State.WAITING, reason + ("; it has no GPS position" if no_fix else ""))
+        reason = "no GPS position: placed by its neighbours" if no_fix else ""
+        if sizes[self._block.component[i]] < max(sizes):
+            reason = "not connected with the main block: placed by GPS with the few photos that it matches"
+        return PhotoStatus(name, State.PLACED, reason)
+
+    def _register(self, prepared: PreparedPhoto) -> int | None:
+        """The index of a usable photo, made known to the reconstruction; None (and the fault) for an unusable one."""
+        index, photo = len(self._names), prepared.photo
+        self._names.append(photo.name)
+        fault = prepared.fault
+        if prepared.digest in self._digests:
+            fault = f"the same file as {self._digests[prepared.digest]}"
+        self._digests.setdefault(prepared.digest, photo.name)
+        if fault is not None or prepared.image is None or prepared.features is None or prepared.camera is None:
+            self._faults[index] = fault or "no image"
+            return None
+        p_ecef = None
+        if photo.fix is not None:
+            p_ecef = geodetic_to_ecef(photo.fix.latitude_deg, photo.fix.longitude_deg, photo.fix.height)
+        self._entries[index] = _Entry(photo, thumbnail(prepared.image), prepared.features, p_ecef)
+        scale = max(1.0, max(prepared.image.shape[:2]) / self.settings.working_px)
+        uv = prepared.features.uv.astype(np.float64)
+        self._block.add_photo(index, uv, scale, prepared.camera, self._prior(photo))
+        return index
+
+    def _prior(self, photo: Photo) -> PosePrior:
+        p_world, p_sigma = None, np.zeros(3)
+        if photo.fix is not None and self.datum is not None:
+            fix = photo.fix
+            p_ecef = geodetic_to_ecef(fix.latitude_deg, fix.longitude_deg, fix.height)
+            p_world = T_ecef_enu(self.datum).inverse().apply(p_ecef)
+            p_sigma = np.array([fix.sigma_horizontal, fix.sigma_horizontal, fix.sigma_vertical])
+        nadir_sigma = float(np.radians(self.settings.nadir_sigma_deg))
+        return PosePrior(p_world, p_sigma, photo.R_enu_cam, photo.attitude_sigma, nadir_sigma)
+
+    def _match(self, index: int) -> None:
+        entry, block = self._entries[index], self._block
+        for other in self._neighbours(index):
+            pairs = match(self._entries[other].features, entry.features, self.settings, block.scale_of[index])
+            if len(pairs):
+                self._matches[other, index] = pairs
+                block.tracks.link(other, index, pairs)
+
+    def _neighbours(self, index: int) -> list[int]:
+        """Earlier photos that may show the same ground: the nearest by GPS, and the latest where there is none."""
+        mine = self._entries[index].p_ecef
+        others = [i for i in self._entries if i != index]
+        by_time = others[-self.settings.neighbours // 2 :]
+        if mine is None:
+            return by_time
+        located = {i: p for i in others if (p := self._entries[i].p_ecef) is not None}
+        distance = {i: float(np.linalg.norm(p - mine)) for i, p in located.items()}
+        reach = self._reach()
+        near = sorted((i for i in located if distance[i] < reach), key=lambda i: distance[i])
+        return near[: self.settings.neighbours] + [i for i in by_time if i not in located]
+
+    def _reach(self) -> float:
+        """Distance beyond which two photos cannot overlap, m: the diagonal of a footprint, once heights are known."""
+        if not self._block.poses:
+            return np.inf
+        last = max(self._block.poses)
+        camera = self._block.camera(last)
+        sigma = max((e.photo.fix.sigma_horizontal for e in self._entries.values() if e.photo.fix), default=0.0)
+        return self._block.depth(last) * float(np.hypot(camera.width, camera.height)) / camera.fx + 3.0 * sigma
+
+    def _grow(self) -> None:
+        """Place every photo that can be placed now, start a block where none can, and adjust."""
+        while self._place_best() or self._start():
+            self._adjust_if_due()
+
+    def _place_best(self) -> bool:
+        block = self._block
+        support = {i: len(block.seen_points(i)[1]) for i in self._entries if i not in block.poses}
+        for i in sorted(support, key=lambda i: -support[i]):
+            component = block.resect(i) if support[i] >= self.settings.min_resection else None
+            if component is None:
+                component = self._attach(i)
+            if component is not None:
+                self._merge_into(component, i)
+                block.triangulate([i], self.settings.resection_px)
+                self._adjust_around(i)
+                return True
+        return False
+
+    def _attach(self, photo: int) -> int | None:
+        """Place a photo that shares too few points by its relative pose to the placed photo that it matches best.
+
+        Strips with less than half overlap have no point in three photos; the length of the step then comes from GPS.
+        """
+        pairs = sorted((p for p in self._matches if photo in p), key=lambda p: -len(self._matches[p]))
+        for a, b in pairs:
+            other = a if b == photo else b
+            if other not in self._block.poses:
+                continue
+            found = self._relative_pose(other, photo)
+            step = self._step(other, photo)
+            if found is not None and step is not None:
+                T = self._block.poses[other] @ SE3(found.R, found.t * step)
+                self._block.place(photo, T, self._block.component[other])
+                return self._block.component[other]
+        return None
+
+    def _step(self, a: int, b: int) -> float | None:
+        """Distance of two photos by GPS, m; None without fixes."""
+        p_a, p_b = self._entries[a].p_ecef, self._entries[b].p_ecef
+        return None if p_a is None or p_b is None else float(np.linalg.norm(p_b - p_a))
+
+    def _relative_pose(self, a: int, b: int) -> SE3 | None:
+        """`T_a_b` with a translation of length one from the matches of two photos; None if they do not tell it."""
+        block = self._block
+        pairs = self._matches[a, b] if (a, b) in self._matches else self._matches[b, a][:, ::-1]
+        uv_a, uv_b = block.uv[a][pairs[:, 0]], block.uv[b][pairs[:, 1]]
+        camera_a, camera_b = block.camera(a), block.camera(b)
+        found = relative_pose(camera_a, camera_b, uv_a, uv_b, self.settings.verify_px * block.scale_of[a])
+        if found is None or found[1].sum() < self.settings.min_matches:
+            return None
+        T_a_b, good = found
+        _, angles = triangulate_pair(T_a_b, camera_a.rays(uv_a[good]), camera_b.rays(uv_b[good]))
+        return T_a_b if np.median(angles) > np.radians(MIN_PAIR_ANGLE_DEG) else None
+
+    def _merge_into(self, component: int, photo: int) -> None:
+        """Let a smaller component that this photo connects be placed again on the larger one."""
+        linked = {
+            self._block.component[i]
+            for pair in self._matches
+            if photo in pair
+            for i in pair
+            if i in self._block.component
+        }
+        for other in linked - {component}:
+            if len(self._block.photos(other)) <= len(self._block.photos(component)):
+                self._block.dissolve(other)
+
+    def _start(self) -> bool:
+        """Start a component from the best pair of photos that have none."""
+        free = [p for p in self._matches if not any(i in self._block.poses for i in p)]
+        for a, b in sorted(free, key=lambda p: -len(self._matches[p])):
+            if self._entries[a].p_ecef is not None and self._entries[b].p_ecef is not None and self._start_with(a, b):
+                return True
+        return False
+
+    def _start_with(self, a: int, b: int) -> bool:
+        block, T_a_b = self._block, self._relative_pose(a, b)
+        if T_a_b is None:
+            return False
+        self._set_datum(a)
+        found = georeference([SE3.identity(), T_a_b], [block.priors[a], block.priors[b]])
+        if found is None:
+            return False
+        similarity = found.similarity
+        component = self._components
+        self._components += 1
+        block.place(a, similarity.pose(SE3.identity()), component)
+        block.place(b, similarity.pose(T_a_b), component)
+        block.triangulate([a, b], self.settings.resection_px)
+        block.adjust([a, b], [], calibrate=False, per_photo=self.settings.observations_per_photo, want_sigma=False)
+        block.prune([a, b], self.settings.resection_px)
+        return True
+
+    def _set_datum(self, photo: int) -> None:
+        """The world begins at the first photo that matched another: a stray first photo does not decide it."""
+        fix = self._entries[photo].photo.fix
+        if self.datum is not None or fix is None:
+            return
+        self.datum = Datum(self.flight, fix.latitude_deg, fix.longitude_deg, fix.height)
+        for i, entry in self._entries.items():
+            self._block.priors[i] = self._prior(entry.photo)
+
+    def _adjust_around(self, photo: int) -> None:
+        """Adjust a new photo and those that share most with it, held by the next ones."""
+        block = self._block
+        shared: dict[int, int] = {}
+        for track in block.seen_points(photo)[1]:
+            for i in block.tracks.members(track):
+                if i in block.poses and i != photo:
+                    shared[i] = shared.get(i, 0) + 1
+        order = sorted(shared, key=lambda i: -shared[i])
+        free = [photo, *order[:LOCAL_FREE]]
+        fixed = order[LOCAL_FREE : LOCAL_FREE + LOCAL_FIXED]
+        block.adjust(
+            free, fixed, calibrate=False, per_photo=self.settings.observations_per_photo // 2, want_sigma=False
+        )
+        block.prune(free, self.settings.resection_px)
+        block.triangulate(free, self.settings.resection_px)
+
+    def _adjust_if_due(self) -> None:
+        if self.placed >= max(self._adjusted * self.settings.growth, self._adjusted + 1):
+            self._adjust_all(final=False)
+            self._adjusted = self.placed
+
+    def _adjust_all(self, final: bool) -> None:
+        """Fit every component to its fixes, then adjust all photos together with the intrinsics."""
+        block, s = self._block, self.settings
+        for component in range(self._components):
+            self._fit_to_fixes(component)
+        photos = sorted(block.poses)
+        calibrate = self._spread() > CALIBRATE_SPREAD
+        for _ in range(FINAL_ROUNDS if final else 1):
+            block.adjust(photos, [], calibrate, s.observations_per_photo, want_sigma=False)
+            block.retrack(self._matches, block.residual_limit_px())
+        if final:
+            block.adjust(photos, [], calibrate, 2 * s.observations_per_photo, want_sigma=True)
+            block.prune(photos, block.residual_limit_px())
+
+    def _spread(self) -> float:
+        """Extent of the block across its longest direction, in heights above ground (one sigma)."""
+        block = self._block
+        centres = np.array([T.t[:2] for T in block.poses.values()])
+        depth = float(np.median([block.depth(i) for i in block.poses]))
+        across = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(centres))
+        return float(across) / max(depth, 1e-6)
+
+    def _fit_to_fixes(self, component: int) -> None:
+        block = self._block
+        photos = block.photos(component)
+        priors = [self._prior(self._entries[i].photo) for i in photos]
+        fit = georeference([block.poses[i] for i in photos], priors)
+        if fit is None:
+            return
+        worse = np.array([fit.horizontal_factor, fit.horizontal_factor, fit.vertical_factor])
+        tracks = {t for i in photos for t in block.seen_points(i)[1]}
+        for i, prior in zip(photos, priors, strict=True):
+            block.priors[i] = replace(prior, p_sigma=prior.p_sigma * worse)
+            block.poses[i] = fit.similarity.pose(block.poses[i])
+        for t in tracks:
+            block.points[t] = fit.similarity.points(block.points[t])
+
+    def _moved(self) -> list[Keyframe]:
+        """Keyframes of the photos whose ground has moved by more than `settings.moved` since they were last given."""
+        keyframes = []
+        for i in sorted(self._block.poses):
+            entry, now = self._entries[i], (self._block.poses[i], self._block.camera(i))
+            if entry.published is None or self._shift(i, entry.published, now) > self.settings.moved:
+                entry.revision += 1
+                entry.published = now
+                keyframes.append(self._keyframe(i))
+        return keyframes
+
+    def _shift(self, i: int, before: tuple[SE3, CameraModel], now: tuple[SE3, CameraModel]) -> float:
+        """How far the ground under the middle and the corners of a photo has moved, m."""
+        w, h = now[1].width - 1.0, now[1].height - 1.0
+        uv = np.array([[w / 2, h / 2], [0, 0], [w, 0], [0, h], [w, h]])
+        depth = self._block.depth(i)
+        ground = [T.apply(camera.rays(uv) * depth) for T, camera in (before, now)]
+        return float(np.linalg.norm(ground[1] - ground[0], axis=1).max())
+
+    def _keyframe(self, i: int) -> Keyframe:
+        entry = self._entries[i]
+        return Keyframe(
+            flight=self.flight,
+            index=i,
+            revision=entry.revision,
+            t_ns=entry.photo.t_ns,
+            name=entry.photo.name,
+            T_world_cam=self._block.poses[i],
+            camera=self._block.camera(i),
+            sigma=self._block.sigmas.get(i, self._fix_sigma(entry.photo.fix)),
+            thumbnail=entry.thumbnail,
+        )
+
+    def _fix_sigma(self, fix: GnssFix | None) -> F64:
+        """Position sigma (3,) m before an adjustment has said more: that of a mean of the fixes so far."""
+        fix = fix or next(e.photo.fix for e in self._entries.values() if e.photo.fix is not None)
+        sigma = np.array([fix.sigma_horizontal, fix.sigma_horizontal, fix.sigma_vertical])
+        return np.asarray(sigma / np.sqrt(max(1, self.placed)))
+
+
+def thumbnail(image: U8) -> bytes:
+    """A small JPEG of an RGB image (H, W, 3)."""
+    scale = THUMBNAIL_PX / max(image.shape[:2])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return bytes(jpeg.tobytes())

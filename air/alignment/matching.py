@@ -1,0 +1,55 @@
+"""Which features of two photos show the same point: descriptors first, then one epipolar geometry for all."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from air.alignment.prepare import Features
+from air.alignment.settings import AlignmentSettings
+from common.arrays import I64, Bool
+
+USAC_CONFIDENCE = 0.999
+USAC_ITERATIONS = 3000
+
+
+def match(a: Features, b: Features, settings: AlignmentSettings, scale: float) -> I64:
+    """Verified matches (M, 2) as feature indices of a and b; empty when there are fewer than `settings.min_matches`.
+
+    The strongest features come first; all of them only where those give too few. `scale` is full-image px per
+    working px.
+    """
+    found = _match(a.strongest(settings.quick_features), b.strongest(settings.quick_features), settings, scale)
+    return found if len(found) >= settings.enough_matches else _match(a, b, settings, scale)
+
+
+def _match(a: Features, b: Features, settings: AlignmentSettings, scale: float) -> I64:
+    candidates = mutual_nearest(a, b, settings.ratio)
+    if len(candidates) < settings.min_matches:
+        return np.zeros((0, 2), np.int64)
+    inliers = candidates[_epipolar_inliers(a, b, candidates, settings.verify_px * scale)]
+    return inliers if len(inliers) >= settings.min_matches else np.zeros((0, 2), np.int64)
+
+
+def mutual_nearest(a: Features, b: Features, ratio: float) -> I64:
+    """Pairs (M, 2) that are each other's nearest by descriptor and clearly nearer than the second (Lowe's ratio)."""
+    if len(a.uv) < 2 or len(b.uv) < 2:
+        return np.zeros((0, 2), np.int64)
+    similarity = a.descriptors @ b.descriptors.T
+    rows = np.arange(len(a.uv))
+    nearest = similarity.argmax(axis=1)
+    best = similarity[rows, nearest]
+    similarity[rows, nearest] = -1.0
+    distinct = np.flatnonzero((1.0 - best) < ratio**2 * (1.0 - similarity.max(axis=1)))
+    similarity[rows, nearest] = best
+    mutual = similarity[:, nearest[distinct]].argmax(axis=0) == distinct
+    return np.stack([distinct[mutual], nearest[distinct[mutual]]], axis=1)
+
+
+def _epipolar_inliers(a: Features, b: Features, pairs: I64, threshold_px: float) -> Bool:
+    """Mask of the pairs that one fundamental matrix explains. It needs no intrinsics, which are only guessed yet."""
+    cv2.setRNGSeed(0)
+    _, mask = cv2.findFundamentalMat(
+        a.uv[pairs[:, 0]], b.uv[pairs[:, 1]], cv2.USAC_MAGSAC, threshold_px, USAC_CONFIDENCE, USAC_ITERATIONS
+    )
+    return np.zeros(len(pairs), bool) if mask is None else mask.ravel().astype(bool)

@@ -1,0 +1,94 @@
+"""What every source looks like, and how one is opened by its URL."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from common.errors import SourceError
+from common.messages import Photo
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something wrong with one photo that the source could work around: its file name and what was wrong."""
+
+    name: str
+    text: str
+
+
+class Truth(Protocol):
+    """What a simulated flight knows and an estimator does not."""
+
+    def write(self, folder: Path) -> None:
+        """Write trajectory, datum, camera and surface as files into a folder, creating it."""
+        ...
+
+
+class Source(Protocol):
+    """Photos in time order. `truth` is None for real flights."""
+
+    @property
+    def url(self) -> str:
+        """The URL that opened the source."""
+        ...
+
+    @property
+    def truth(self) -> Truth | None:
+        """The truth of a simulated flight."""
+        ...
+
+    @property
+    def problems(self) -> Sequence[Problem]:
+        """What was wrong with single photos, as far as known: complete once the iteration has ended."""
+        ...
+
+    def __iter__(self) -> Iterator[Photo]: ...
+
+    def __len__(self) -> int: ...
+
+
+def open_source(
+    url: str,
+    pace: float | None = None,
+    *,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Source:
+    """The source that a URL names, e.g. `photos:flights/monday` or `sim:survey?seed=1&photos=60`.
+
+    `pace` None gives photos as fast as they can be read, 1.0 at the pace of their time stamps, 2.0 twice as fast.
+    `clock` (monotonic, s) and `sleep` (s) serve the pace. Raises SourceError, in one line, for an unknown scheme,
+    a folder without photos, or an option that is unknown or impossible.
+    """
+    scheme, colon, rest = url.partition(":")
+    if not colon or scheme not in _OPENERS:
+        schemes = ", ".join(sorted(_OPENERS))
+        raise SourceError(f"source {url!r} has no known scheme; use one of {schemes}, for example photos:DIR")
+    if pace is not None and not 0.0 < pace < float("inf"):
+        raise SourceError(f"source {url!r}: pace is {pace}, must be a positive number (1 = as flown)")
+    source = _OPENERS[scheme](url, rest)
+    if pace is None:
+        return source
+    from air.sources.pace import Paced
+
+    return Paced(source, pace, clock, sleep)
+
+
+def _open_photos(url: str, rest: str) -> Source:
+    # Imported when needed: a folder of photos needs no compiler, the simulator no image reader.
+    from air.sources.photos import PhotoFolder
+
+    return PhotoFolder(url, rest)
+
+
+def _open_simulated(url: str, rest: str) -> Source:
+    from air.sources.simulated.survey import open_survey
+
+    return open_survey(url, rest)
+
+
+_OPENERS: dict[str, Callable[[str, str], Source]] = {"photos": _open_photos, "sim": _open_simulated}

@@ -1,0 +1,73 @@
+"""Settings of the ground service, with defaults that work on one machine."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from common.bus import BusConfig
+from common.config import Range
+from common.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class StationBus:
+    """How the station joins: as the router that listens for everyone, or as a client of another station.
+
+    `listen` counts for a router, `connect` for both: endpoints read like `tcp/192.168.1.10:7447`.
+    """
+
+    mode: Literal["router", "client"] = "router"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = ()
+    shared_memory: bool = True
+
+    @property
+    def of_station(self) -> BusConfig:
+        """Settings of the station's own session."""
+        listen = self.listen if self.mode == "router" else ()
+        return BusConfig(self.mode, self.connect, listen, self.shared_memory)
+
+    @property
+    def of_guest(self) -> BusConfig:
+        """Settings of another program on the station's machine."""
+        if self.mode == "client":
+            return self.of_station
+        local = (re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in self.listen)
+        return BusConfig("client", tuple(local), (), self.shared_memory)
+
+
+@dataclass(frozen=True)
+class StoreConfig:
+    """Where the map is kept: a file, created with its folder."""
+
+    path: Path = Path("luojia-data/ground.sqlite")
+
+
+@dataclass(frozen=True)
+class ViewerConfig:
+    """Where browsers find the viewer, and how many points each of them draws at most."""
+
+    enabled: bool = True
+    host: str = "127.0.0.1"
+    port: Annotated[int, Range(1, 65535)] = 8080
+    point_budget: Annotated[int, Range(1_000, 20_000_000)] = 400_000
+
+
+@dataclass(frozen=True)
+class GroundConfig:
+    """One ground station; `station` is its name on the bus, `min_views` how many photos must agree on a cell."""
+
+    station: str = "ground"
+    min_views: Annotated[int, Range(1, 255)] = 2
+    bus: StationBus = field(default_factory=StationBus)
+    store: StoreConfig = field(default_factory=StoreConfig)
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", self.station):
+            raise ConfigError(f"station is {self.station!r}; allowed: 1 to 32 letters, digits, - and _")
+        if self.bus.mode == "client" and not self.bus.connect:
+            raise ConfigError("bus.connect is empty; a client needs the endpoint of a station, tcp/HOST:7447")

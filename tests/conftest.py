@@ -1,0 +1,21 @@
+"""Fixtures that the tests share."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def real_data() -> Callable[[str], Path]:
+    """Folder of a real recording by name; skips the test where the recordings are not installed."""
+
+    def find(name: str) -> Path:
+        folder = DATA / name
+        if not folder.exists():
+            pytest.skip(f"the recording {name!r} is not beside this checkout")
+        return folder
+
+    return find
