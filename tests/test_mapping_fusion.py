@@ -1,5 +1,6 @@
 """Cells: from the mesh of a pair to layers, from layers to one surface."""
 
+import cv2
 import numpy as np
 from mapping_scene import keyframe
 from test_mapping_geometry import exact_correspondences
@@ -50,7 +51,10 @@ def test_two_pairs_that_differ_are_disputed_and_two_views_at_most():
 
 
 def test_of_equal_surfaces_the_upper_one_is_shown():
-    for stack in ([flat_layer((0, 1), 1.0), flat_layer((2, 3), 4.0)], [flat_layer((2, 3), 4.0), flat_layer((0, 1), 1.0)]):
+    for stack in (
+        [flat_layer((0, 1), 1.0), flat_layer((2, 3), 4.0)],
+        [flat_layer((2, 3), 4.0), flat_layer((0, 1), 1.0)],
+    ):
         np.testing.assert_allclose(fuse(stack, CELL, N).height, 4.0)
 
 
@@ -102,15 +106,6 @@ def test_sloping_mesh_has_exact_heights_at_cell_centres_and_no_holes():
             error = np.abs(layer.height - truth)
             assert np.nanmax(error) < 0.01
             seen += np.isfinite(error).sum()
-        low, high = (f(points.p_origin[..., :2].reshape(-1, 2), axis=0) for f in (np.nanmin, np.nanmax))
-        # The footprint is a rectangle turned by the direction of the baseline, so it fills part of its bounds.
         known = points.p_origin[np.isfinite(points.p_origin[..., 2])][:, :2]
-        area = _hull_area(known)
+        area = cv2.contourArea(cv2.convexHull(known.astype(np.float32)))
         assert seen * cell**2 > 0.96 * area
-        assert area <= np.prod(high - low)
-
-
-def _hull_area(xy):
-    import cv2
-
-    return cv2.contourArea(cv2.convexHull(xy.astype(np.float32)))

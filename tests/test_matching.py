@@ -58,7 +58,7 @@ def test_predicted_sigma_fits_the_errors():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_step_keeps_its_place_and_nothing_floats_between_the_levels(method):
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    u = np.broadcast_to(np.arange(SHAPE[1], dtype=float), SHAPE)
     # The left image shows a plateau (nearer, disparity 12) over columns 150 to 230; what it hides is not rendered.
     truth = np.where((u > 150) & (u < 230), 12.0, 0.0)
     found = match(*pair(truth), EVERYWHERE, EVERYWHERE, -10, 25, method)

@@ -8,8 +8,8 @@ from enum import StrEnum
 import cv2
 import numpy as np
 
-from air.alignment.bundle import PosePrior
-from air.alignment.geometry import relative_pose, triangulate_pair
+from air.alignment.bundle import DOWN, PosePrior
+from air.alignment.geometry import PairPrior, relative_pose, triangulate_pair
 from air.alignment.georeference import georeference
 from air.alignment.matching import match
 from air.alignment.prepare import Features, PreparedPhoto
@@ -153,8 +153,10 @@ class Alignment:
             p_ecef = geodetic_to_ecef(fix.latitude_deg, fix.longitude_deg, fix.height)
             p_world = T_ecef_enu(self.datum).inverse().apply(p_ecef)
             p_sigma = np.array([fix.sigma_horizontal, fix.sigma_horizontal, fix.sigma_vertical])
-        nadir_sigma = float(np.radians(self.settings.nadir_sigma_deg))
-        return PosePrior(p_world, p_sigma, photo.R_enu_cam, photo.attitude_sigma, nadir_sigma)
+        down, sigma = -DOWN, float(np.radians(self.settings.nadir_sigma_deg))
+        if photo.R_enu_cam is not None:
+            down, sigma = photo.R_enu_cam.T @ DOWN, photo.attitude_sigma
+        return PosePrior(p_world, p_sigma, down, sigma)
 
     def _match(self, index: int) -> None:
         entry, block = self._entries[index], self._block
@@ -234,7 +236,8 @@ class Alignment:
         pairs = self._matches[a, b] if (a, b) in self._matches else self._matches[b, a][:, ::-1]
         uv_a, uv_b = block.uv[a][pairs[:, 0]], block.uv[b][pairs[:, 1]]
         camera_a, camera_b = block.camera(a), block.camera(b)
-        found = relative_pose(camera_a, camera_b, uv_a, uv_b, self.settings.verify_px * block.scale_of[a])
+        threshold_px = self.settings.verify_px * block.scale_of[a]
+        found = relative_pose(camera_a, camera_b, uv_a, uv_b, threshold_px, self._pair_prior(a, b))
         if found is None or found[1].sum() < self.settings.min_matches:
             return None
         T_a_b, good = found
@@ -253,6 +256,16 @@ class Alignment:
         for other in linked - {component}:
             if len(self._block.photos(other)) <= len(self._block.photos(component)):
                 self._block.dissolve(other)
+
+    def _pair_prior(self, a: int, b: int) -> PairPrior:
+        prior_a, prior_b = self._prior(self._entries[a].photo), self._prior(self._entries[b].photo)
+        sigma = float(np.hypot(prior_a.down_sigma, prior_b.down_sigma))
+        fix_a, fix_b, step = self._entries[a].photo.fix, self._entries[b].photo.fix, self._step(a, b)
+        if fix_a is None or fix_b is None or not step:
+            return PairPrior(prior_a.down_cam, prior_b.down_cam, sigma, 0.0, 1.0)
+        height_sigma = float(np.hypot(fix_a.sigma_vertical, fix_b.sigma_vertical)) / step
+        descent = (fix_a.height - fix_b.height) / step
+        return PairPrior(prior_a.down_cam, prior_b.down_cam, sigma, descent, float(np.hypot(height_sigma, sigma)))
 
     def _start(self) -> bool:
         """Start a component from the best pair of photos that have none."""

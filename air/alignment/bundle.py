@@ -41,16 +41,16 @@ class CameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """What is known of a camera's pose without images: position (3,) m with sigma (3,), attitude with sigma rad.
+    """What is known of a camera's pose without images.
 
-    Position and attitude may be None; without an attitude the camera is taken to look down within `nadir_sigma` rad.
+    Position (3,) m with sigma (3,), or None; the unit vector (3,) that points down, in the camera frame, with sigma
+    rad. The heading is left open: gimbals get it wrong, and steps between positions tell it better.
     """
 
     p_world: F64 | None
     p_sigma: F64
-    R_world_cam: F64 | None
-    R_sigma: float
-    nadir_sigma: float
+    down_cam: F64
+    down_sigma: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,13 +147,8 @@ def _add_pose_priors(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem) 
             for axes in ([True, True, False], [False, False, True]):
                 sigmas = np.where(axes, prior.p_sigma, UNKNOWN)
                 graph.add(gtsam.GPSFactor(X(i), prior.p_world, _robust(noise.Diagonal.Sigmas(sigmas))))
-        if prior.R_world_cam is not None:
-            sigmas = np.r_[np.full(3, prior.R_sigma), np.full(3, UNKNOWN)]
-            model = _robust(noise.Diagonal.Sigmas(sigmas))
-            graph.add(gtsam.PriorFactorPose3(X(i), gtsam.Pose3(gtsam.Rot3(prior.R_world_cam), T.t), model))
-        else:
-            model = _robust(noise.Isotropic.Sigma(2, prior.nadir_sigma))
-            graph.add(gtsam.AttitudeFactorPose3(X(i), gtsam.Unit3(DOWN), model, gtsam.Unit3(-DOWN)))
+        model = _robust(noise.Isotropic.Sigma(2, prior.down_sigma))
+        graph.add(gtsam.AttitudeFactorPose3(X(i), gtsam.Unit3(DOWN), model, gtsam.Unit3(prior.down_cam)))
 
 
 def _add_camera_priors(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -10,24 +12,70 @@ from common.camera import CameraModel
 from common.se3 import SE3
 
 CONFIDENCE = 0.999
+NEARLY_ALL = 0.9
+"""Share of the most matches that a rival pose must explain to be a rival."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairPrior:
+    """What is known of two views without their matches: where down is in each camera, and how steep the step is.
+
+    Unit vectors `down_a`, `down_b` (3,) with `down_sigma` rad; `descent` is the part of the step from a to b that
+    points down, of a step of length one, with `descent_sigma`.
+    """
+
+    down_a: F64
+    down_b: F64
+    down_sigma: float
+    descent: float
+    descent_sigma: float
+
+    def cost(self, T_a_b: SE3) -> float:
+        """How far a relative pose is from what is known, in squared sigmas."""
+        tilt = np.arccos(np.clip(self.down_a @ T_a_b.R @ self.down_b, -1.0, 1.0)) / self.down_sigma
+        descent = (self.down_a @ T_a_b.t - self.descent) / self.descent_sigma
+        return float(tilt**2 + descent**2)
 
 
 def relative_pose(
-    camera_a: CameraModel, camera_b: CameraModel, uv_a: F64, uv_b: F64, threshold_px: float
+    camera_a: CameraModel, camera_b: CameraModel, uv_a: F64, uv_b: F64, threshold_px: float, prior: PairPrior
 ) -> tuple[SE3, Bool] | None:
     """`T_a_b` with a translation of length one and the mask (M,) of matches that agree; None if there is none.
 
-    Five-point essential matrix with USAC on undistorted rays (Nistér, PAMI 2004), then the cheirality test.
+    Flat ground has two explanations that fit equally well (Longuet-Higgins, 1986), so the essential matrix (five
+    points, USAC) and the homography are both taken apart, and of all the poses that explain nearly as many matches as
+    the best the one nearest to the prior is chosen.
     """
     xy_a, xy_b = camera_a.rays(uv_a)[:, :2], camera_b.rays(uv_b)[:, :2]
+    threshold = threshold_px / camera_a.fx
+    candidates = [(T_a_b, _agreeing(T_a_b, xy_a, xy_b, threshold)) for T_a_b in _pose_candidates(xy_a, xy_b, threshold)]
+    most = max((int(mask.sum()) for _, mask in candidates), default=0)
+    good = [c for c in candidates if c[1].sum() > NEARLY_ALL * most]
+    return min(good, key=lambda c: prior.cost(c[0])) if most else None
+
+
+def _pose_candidates(xy_a: F64, xy_b: F64, threshold: float) -> list[SE3]:
     cv2.setRNGSeed(0)
-    E, mask = cv2.findEssentialMat(
-        xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, CONFIDENCE, threshold_px / camera_a.fx, maxIters=3000
-    )
-    if E is None or E.shape != (3, 3) or mask is None:
-        return None
-    _, R_b_a, t_b_a, mask = cv2.recoverPose(E, xy_a, xy_b, np.eye(3), mask=mask)
-    return SE3(R_b_a, t_b_a.ravel()).inverse(), mask.ravel().astype(bool)
+    R_b_a: list[tuple[F64, F64]] = []
+    E, _ = cv2.findEssentialMat(xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, CONFIDENCE, threshold, maxIters=3000)
+    if E is not None and E.shape == (3, 3):
+        R1, R2, t = cv2.decomposeEssentialMat(E)
+        R_b_a += [(R, sign * t) for R in (R1, R2) for sign in (1.0, -1.0)]
+    H, _ = cv2.findHomography(xy_a, xy_b, cv2.USAC_MAGSAC, threshold, maxIters=3000, confidence=CONFIDENCE)
+    if H is not None:
+        _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+        R_b_a += [(R, t / np.linalg.norm(t)) for R, t in zip(rotations, translations, strict=True) if t.any()]
+    return [SE3(R, t.ravel()).inverse() for R, t in R_b_a]
+
+
+def _agreeing(T_a_b: SE3, xy_a: F64, xy_b: F64, threshold: float) -> Bool:
+    """Matches (M,) whose triangulated point lies in front of both cameras and appears where it was seen."""
+    homogeneous = [np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_a, xy_b)]
+    p_a, _ = triangulate_pair(T_a_b, *homogeneous)
+    p_b = T_a_b.inverse().apply(p_a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = [np.linalg.norm(p[:, :2] / p[:, 2:] - xy, axis=1) for p, xy in ((p_a, xy_a), (p_b, xy_b))]
+        return np.asarray((np.maximum(*error) < threshold) & (p_a[:, 2] > 0) & (p_b[:, 2] > 0))
 
 
 def resect(camera: CameraModel, p_world: F64, uv: F64, threshold_px: float) -> tuple[SE3, Bool] | None:

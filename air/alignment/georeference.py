@@ -9,7 +9,7 @@ import numpy as np
 
 from air.alignment.bundle import DOWN, HUBER, PosePrior
 from common.arrays import F64
-from common.se3 import SE3, rotation_vector, rotation_vector_to_matrix, skew
+from common.se3 import SE3, rotation_vector_to_matrix, skew
 
 ITERATIONS = 15
 JUDGE_FROM = 5
@@ -47,7 +47,7 @@ class Georeference:
 def georeference(poses: Sequence[SE3], priors: Sequence[PosePrior]) -> Georeference | None:
     """The similarity that brings the cameras to their priors; None with fewer than two distinct positions.
 
-    Upright by the attitudes (or, where unknown, by the cameras' looking down), turned and scaled by the horizontal
+    Upright by where the cameras say down is, turned and scaled by the horizontal
     positions: a start that one straight strip determines and that heights cannot spoil. Then Gauss–Newton on all
     priors with Huber weights, in which the scatter of the fixes decides how much they count (variance components):
     receivers in cameras drift by tens of metres in height while they say nothing of it.
@@ -60,9 +60,8 @@ def georeference(poses: Sequence[SE3], priors: Sequence[PosePrior]) -> Georefere
 
 
 def _start(poses: Sequence[SE3], priors: Sequence[PosePrior], located: list[int]) -> Similarity | None:
-    B = sum((_attitude(T, p) for T, p in zip(poses, priors, strict=True)), np.zeros((3, 3)))
-    U, _, Vt = np.linalg.svd(B)
-    R_up = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    down = sum((T.R @ p.down_cam / p.down_sigma**2 for T, p in zip(poses, priors, strict=True)), np.zeros(3))
+    R_up = _rotation_between(down / np.linalg.norm(down), DOWN)
     free = np.array([R_up @ poses[i].t for i in located])
     fixes = np.array([priors[i].p_world for i in located])
     free_mid, fix_mid = np.median(free, axis=0), np.median(fixes, axis=0)
@@ -77,13 +76,6 @@ def _start(poses: Sequence[SE3], priors: Sequence[PosePrior], located: list[int]
         return None
     R = rotation_vector_to_matrix(np.array([0.0, 0.0, np.arctan2(sine, cosine)])) @ R_up
     return Similarity(scale, R, fix_mid - scale * (R @ R_up.T @ free_mid))
-
-
-def _attitude(T: SE3, prior: PosePrior) -> F64:
-    """Wahba's matrix (3, 3) of an attitude prior: three axes, or the optical axis that looks down."""
-    if prior.R_world_cam is not None:
-        return np.asarray(prior.R_world_cam @ T.R.T / prior.R_sigma**2)
-    return np.outer(DOWN, T.R[:, 2]) / prior.nadir_sigma**2
 
 
 def _refine(
@@ -103,7 +95,7 @@ def _refine(
         J, r = _position_rows(arm, residual, sigma * factors)
         J_att, r_att = _attitude_rows(R, poses, priors)
         J, r = np.vstack([J, J_att]), np.concatenate([r, r_att])
-        step = np.linalg.lstsq(J, -r, rcond=None)[0]
+        step: F64 = np.linalg.lstsq(J, -r, rcond=None)[0]
         R = rotation_vector_to_matrix(step[:3]) @ R
         scale *= float(np.exp(np.clip(step[3], -0.5, 0.5)))
         centre = centre + step[4:]
@@ -117,7 +109,7 @@ def _factors(whitened: F64) -> F64:
         return np.ones(3)
     horizontal = float(np.median(np.linalg.norm(whitened[:, :2], axis=1))) / RAYLEIGH_MEDIAN
     vertical = float(np.median(np.abs(whitened[:, 2]))) / NORMAL_MEDIAN
-    return np.maximum(1.0, np.array([horizontal, horizontal, vertical]))
+    return np.array([max(1.0, horizontal), max(1.0, horizontal), max(1.0, vertical)])
 
 
 def _position_rows(arm: F64, residual: F64, sigma: F64) -> tuple[F64, F64]:
@@ -136,13 +128,18 @@ def _position_rows(arm: F64, residual: F64, sigma: F64) -> tuple[F64, F64]:
 def _attitude_rows(R: F64, poses: Sequence[SE3], priors: Sequence[PosePrior]) -> tuple[F64, F64]:
     rows, residuals = [], []
     for T, prior in zip(poses, priors, strict=True):
-        if prior.R_world_cam is not None:
-            r = rotation_vector(R @ T.R @ prior.R_world_cam.T) / prior.R_sigma
-            J = np.eye(3) / prior.R_sigma
-        else:
-            axis = R @ T.R[:, 2]
-            r, J = axis[:2] / prior.nadir_sigma, -skew(axis)[:2] / prior.nadir_sigma
+        down = R @ T.R @ prior.down_cam
+        r, J = down[:2] / prior.down_sigma, -skew(down)[:2] / prior.down_sigma
         weight = np.sqrt(min(1.0, HUBER / max(float(np.linalg.norm(r)), 1e-9)))
-        rows.append(np.hstack([J, np.zeros((len(J), 4))]) * weight)
+        rows.append(np.hstack([J, np.zeros((2, 4))]) * weight)
         residuals.append(r * weight)
     return np.vstack(rows), np.concatenate(residuals)
+
+
+def _rotation_between(a: F64, b: F64) -> F64:
+    """The smallest rotation (3, 3) that turns the unit vector a (3,) into b (3,)."""
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-12:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return rotation_vector_to_matrix(axis / sine * np.arctan2(sine, cosine))

@@ -87,6 +87,8 @@ class Mapper:
 
     def _is_news(self, keyframe: Keyframe) -> bool:
         known = self._keyframes.get(keyframe.index)
+        if not np.isfinite(keyframe.T_world_cam.matrix).all():
+            return False
         if known is None:
             return keyframe.index in self._images
         return keyframe.revision > known.revision

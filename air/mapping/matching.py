@@ -25,8 +25,9 @@ NOISE_FLOOR = 2.0
 # Largest share of a window's contrast that may remain unexplained: a normalised correlation of about 0.75.
 MAX_RESIDUAL = 0.55
 MAX_SIGMA_PX = 0.35
-# What no window can do better than, and the noise of normalised images besides what the residual shows.
+# What no window can do better than, and the least noise of normalised images: a blank wall has no residual either.
 MIN_SIGMA_PX = 0.05
+RESIDUAL_FLOOR = 0.01
 MIN_UNIQUENESS = 1.12
 LEFT_RIGHT_PX = 1.5
 SPECKLE_PIXELS = 150
@@ -126,18 +127,18 @@ def _refine(left: F32, right: F32, start: F32, radius: int) -> F32:
     """
     wide, narrow = (np.ones((size, size), np.uint8) for size in (4 * radius - 1, 5))
     best, least = start, _window_cost(left, right, start, radius)
-    for propose in (
-        lambda: start + 1,
-        lambda: start - 1,
-        lambda: cv2.dilate(start, wide),
-        lambda: cv2.erode(start, wide),
-        lambda: cv2.dilate(best, narrow),
-        lambda: cv2.erode(best, narrow),
-    ):
-        field = propose()
+
+    def offer(field: F32) -> None:
+        nonlocal best, least
         cost = _window_cost(left, right, field, radius)
-        better = cost < least
-        best, least = np.where(better, field, best), np.minimum(cost, least)
+        best, least = np.where(cost < least, field, best), np.minimum(cost, least)
+
+    offer(start + 1)
+    offer(start - 1)
+    offer(cv2.dilate(start, wide))
+    offer(cv2.erode(start, wide))
+    offer(cv2.dilate(best, narrow))
+    offer(cv2.erode(best, narrow))
     return _median(best, 3)
 
 
@@ -153,7 +154,7 @@ def _subpixel(left: F32, right: F32, field: F32) -> DisparityMap:
         # A step beyond a pixel leaves the range in which the linearisation holds.
         field = field + np.clip(step, -0.7, 0.7)
     gg, gr, rr = (_box(a, radius) for a in normal_equations(left, right, field))
-    sigma = np.sqrt(rr / (count * (gg + 1e-6)))
+    sigma = np.sqrt((rr + RESIDUAL_FLOOR) / (count * (gg + 1e-6)))
     known = (rr < MAX_RESIDUAL) & (sigma < MAX_SIGMA_PX) & (np.abs(gr / (gg + 1e-4)) < 0.5)
     known &= np.abs(field - start) < 1.5
     return DisparityMap(np.where(known, field, np.nan).astype(np.float32), np.hypot(sigma, MIN_SIGMA_PX))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from rasterio.enums import ColorInterp
 from rasterio.transform import from_origin
 
 from common.arrays import F32, F64, U8, Bool
@@ -45,7 +46,7 @@ def write_ortho(path: Path, surface: Surface, datum: Datum) -> None:
         height, colour = block.resample(surface, with_colour=True)
         rgba[:3, rows] = np.moveaxis(colour, -1, 0)
         rgba[3, rows] = np.where(np.isfinite(height), 255, 0)
-    _write_cog(path, rgba, grid)
+    _write_cog(path, rgba, grid, colours=(ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +174,7 @@ def _write_cog(
     nodata: float | None = None,
     unit: str | None = None,
     description: str | None = None,
+    colours: tuple[ColorInterp, ...] = (),
 ) -> None:
     count, rows, cols = bands.shape
     with rasterio.open(
@@ -187,6 +189,8 @@ def _write_cog(
         crs=f"EPSG:{grid.projection.epsg}",
         transform=from_origin(grid.west, grid.north, grid.pixel, grid.pixel),
     ) as raster:
+        if colours:
+            raster.colorinterp = colours
         raster.write(bands)
         if unit is not None and description is not None:
             raster.units, raster.descriptions = (unit,) * count, (description,) * count
