@@ -65,10 +65,10 @@ def test_alignment_removes_what_was_applied() -> None:
 
 
 def test_ground_that_only_one_cloud_has_counts_in_completeness_alone() -> None:
-    reference = ground(80_000, seed=0)
-    ours = ground(80_000, seed=1)
+    reference = ground(30_000, seed=0, side=60.0)
+    ours = ground(30_000, seed=1, side=60.0)
     ours = ours[ours[:, 0] < 0.0]
-    extra = ground(5_000, seed=2) + [200.0, 0.0, 60.0]
+    extra = ground(1_000, seed=2, side=20.0) + np.array([200.0, 0.0, 60.0])
     alone, with_extra = rows_by_name(ours, reference)["none"], rows_by_name(np.vstack([ours, extra]), reference)["none"]
     assert alone.completeness == pytest.approx(0.5, abs=0.02)
     assert with_extra.to_reference == alone.to_reference
@@ -128,7 +128,7 @@ def test_unreadable_clouds_are_named(tmp_path: Path) -> None:
 def test_clouds_without_common_ground_are_refused_with_their_extents() -> None:
     points = ground(500)
     with pytest.raises(EvaluationError, match="coordinate system"):
-        compare_clouds(Cloud(points + [1e6, 0.0, 0.0]), Cloud(points))
+        compare_clouds(Cloud(points + np.array([1e6, 0.0, 0.0])), Cloud(points))
 
 
 def test_table_and_json_tell_the_same() -> None:

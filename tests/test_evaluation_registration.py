@@ -68,7 +68,7 @@ def test_registration_is_deterministic() -> None:
 def test_clouds_of_different_places_are_refused() -> None:
     source = ground(5_000)
     with pytest.raises(EvaluationError, match="same place"):
-        register(source + [1000.0, 0.0, 0.0], source, with_scale=False)
+        register(source + np.array([1000.0, 0.0, 0.0]), source, with_scale=False)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.03])

@@ -84,14 +84,19 @@ class Alignment:
             return []
         self._match(index)
         self._grow()
-        return self._moved()
+        return self._moved(self.settings.moved)
 
     def finish(self) -> list[Keyframe]:
-        """Keyframes that moved in the final adjustment of all photos with all their observations."""
+        """All keyframes after the final adjustment of all photos."""
         self._grow()
         if self.datum is not None:
             self._adjust_all(final=True)
-        return self._moved()
+        return self._moved(threshold=-1.0)
+
+    def ground_height(self) -> float | None:
+        """Median height of the points of the ground, m in world; None while there are none."""
+        points = self._block.points
+        return float(np.median([p[2] for p in points.values()])) if points else None
 
     @property
     def placed(self) -> int:
@@ -361,12 +366,12 @@ class Alignment:
         for t in tracks:
             block.points[t] = fit.similarity.points(block.points[t])
 
-    def _moved(self) -> list[Keyframe]:
-        """Keyframes of the photos whose ground has moved by more than `settings.moved` since they were last given."""
+    def _moved(self, threshold: float) -> list[Keyframe]:
+        """Keyframes of the photos whose ground has moved by more than a threshold, m, since they were last given."""
         keyframes = []
         for i in sorted(self._block.poses):
             entry, now = self._entries[i], (self._block.poses[i], self._block.camera(i))
-            if entry.published is None or self._shift(i, entry.published, now) > self.settings.moved:
+            if entry.published is None or self._shift(i, entry.published, now) > threshold:
                 entry.revision += 1
                 entry.published = now
                 keyframes.append(self._keyframe(i))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from air.mapping.ground import Ground, estimate_ground
-from air.mapping.layer import layers
+from air.mapping.layer import Layer, layers
 from air.mapping.matching import match
 from air.mapping.pairs import choose_partners
 from air.mapping.rectification import rectify, resample
@@ -66,18 +66,19 @@ class Mapper:
         """The tiles that these keyframes change, each with a revision one higher than before.
 
         A keyframe never seen is matched with its best partners; one with a higher revision whose new pose or
-        intrinsics move the surface is triangulated anew. `ground_height` m in world, if known, says where the ground
-        roughly is as long as the map does not know it.
+        intrinsics move the surface is triangulated anew. Surfaces that moved beyond what one update does follow in
+        the next: without keyframes it only does that, and returns nothing once nothing is left. `ground_height` m in
+        world says roughly where the ground is as long as the map does not know it.
         """
+        if ground_height is not None:
+            self._ground.suppose(ground_height)
         newer = [k for k in keyframes if self._is_news(k)]
         fresh = [k.index for k in newer if k.index not in self._keyframes]
         self._keyframes.update((k.index, k) for k in newer)
-        touched = self._move({k.index for k in newer})
-        if ground_height is not None:
-            self._ground.suppose(ground_height)
+        touched = self._place(self._moved())
         for start in range(0, len(fresh), BATCH):
             pairs = self._new_pairs(fresh[start : start + BATCH])
-            touched |= self._match(pairs)
+            touched |= self._place(self._matched(pairs))
         t_ns = max((k.t_ns for k in self._keyframes.values()), default=0)
         return self._tiles.fuse(flight, t_ns, touched)
 
@@ -93,17 +94,19 @@ class Mapper:
             return keyframe.index in self._images
         return keyframe.revision > known.revision
 
-    def _move(self, changed: set[int]) -> set[TileId]:
-        """Tiles touched by pairs whose surface the new poses and intrinsics move by more than the tolerance."""
-        touched: set[TileId] = set()
-        for photos, old in list(self._contributions.items()):
-            if changed.isdisjoint(photos):
-                continue
+    def _moved(self) -> dict[Photos, Contribution]:
+        """Contributions at their new poses and intrinsics, of the pairs whose surface these move most."""
+        moved: list[tuple[float, Photos, Contribution]] = []
+        for photos, old in self._contributions.items():
             left, right = (self._keyframes[p] for p in photos)
+            if left is old.left and right is old.right:
+                continue
             samples = triangulate(old.matches, left, right, MOVE_STEP)
-            if largest_move(old.samples, samples) > self._settings.move_tolerance:
-                touched |= self._place(photos, Contribution(old.matches, left, right, samples))
-        return touched
+            distance = largest_move(old.samples, samples)
+            if distance > self._settings.move_tolerance:
+                moved.append((distance, photos, Contribution(old.matches, left, right, samples)))
+        moved.sort(key=lambda m: (-m[0], m[1]))
+        return {photos: new for _, photos, new in moved[: self._settings.moves_per_update]}
 
     def _new_pairs(self, indices: Iterable[int]) -> list[Photos]:
         """Pairs of these keyframes with their best partners that were not matched yet, older photo first."""
@@ -121,15 +124,11 @@ class Mapper:
                 pairs[min(index, partner.index), max(index, partner.index)] = None
         return [p for p in pairs if p not in self._contributions]
 
-    def _match(self, pairs: Sequence[Photos]) -> set[TileId]:
-        """Tiles touched by the new pairs; each is matched on its own, so threads change nothing but the time."""
+    def _matched(self, pairs: Sequence[Photos]) -> dict[Photos, Contribution]:
+        """What the new pairs give; each is matched on its own, so threads change nothing but the time."""
         with ThreadPoolExecutor(self._settings.threads) as pool:
             contributions = list(pool.map(self._contribution, pairs))
-        touched: set[TileId] = set()
-        for photos, contribution in zip(pairs, contributions, strict=True):
-            if contribution is not None:
-                touched |= self._place(photos, contribution)
-        return touched
+        return {p: c for p, c in zip(pairs, contributions, strict=True) if c is not None}
 
     def _contribution(self, photos: Photos) -> Contribution | None:
         left, right = (self._keyframes[p] for p in photos)
@@ -149,10 +148,17 @@ class Mapper:
             return None
         return Contribution(matches, left, right, triangulate(matches, left, right, MOVE_STEP))
 
-    def _place(self, photos: Photos, contribution: Contribution) -> set[TileId]:
-        """Tiles touched by putting the pair's surface at its present poses."""
-        self._contributions[photos] = contribution
-        self._ground.learn(photos, contribution.samples)
+    def _place(self, contributions: Mapping[Photos, Contribution]) -> set[TileId]:
+        """Tiles touched by putting the surfaces of these pairs into the map, in place of what they gave before."""
+        with ThreadPoolExecutor(self._settings.threads) as pool:
+            found = list(pool.map(self._layers, contributions, contributions.values()))
+        touched: set[TileId] = set()
+        for (photos, contribution), stack in zip(contributions.items(), found, strict=True):
+            self._contributions[photos] = contribution
+            self._ground.learn(photos, contribution.samples)
+            touched |= self._tiles.replace(photos, stack)
+        return touched
+
+    def _layers(self, photos: Photos, contribution: Contribution) -> dict[TileId, Layer]:
         points = triangulate(contribution.matches, contribution.left, contribution.right)
-        found = layers(contribution.matches, points, photos, self._settings.cell, self._settings.tile_cells)
-        return self._tiles.replace(photos, found)
+        return layers(contribution.matches, points, photos, self._settings.cell, self._settings.tile_cells)

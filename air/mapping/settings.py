@@ -17,7 +17,8 @@ class MappingSettings:
     with each photo. Baselines are given as a share of the height above the ground, overlap as a share of the photo's
     footprint. `images_kept` working copies of at most `image_pixels` px stay in memory, and a pair is matched on a
     grid of at most `match_pixels` px. A pair is triangulated again when new poses or intrinsics move its surface by
-    more than `move_tolerance`. `threads` pairs are matched at once; the result does not depend on it.
+    more than `move_tolerance`, at most `moves_per_update` pairs at a time, those that moved most first. `threads` pairs
+    are worked on at once; the result does not depend on it.
     """
 
     cell: float = 0.10
@@ -32,6 +33,7 @@ class MappingSettings:
     match_pixels: int = 1_000_000
     images_kept: int = 150
     move_tolerance: float = 0.03
+    moves_per_update: int = 16
     threads: int = 2
 
     def __post_init__(self) -> None:
@@ -47,6 +49,7 @@ class MappingSettings:
             "match_pixels": (10_000, 100_000_000),
             "images_kept": (2, 100_000),
             "move_tolerance": (0.0, 100.0),
+            "moves_per_update": (1, 100_000),
             "threads": (1, 64),
         }
         for name, (low, high) in limits.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ Writer = Callable[[Path], None]
 
 TRAJECTORY_PRODUCTS = ("datum.json", "trajectory.tum", "trajectory.geojson")
 MAP_PRODUCTS = ("map.laz", "map.ply", "dsm.tif", "ortho.tif", "mesh.glb", "mesh.ply")
+_WRITERS_AT_ONCE = 2
 
 
 def write_products(
@@ -41,8 +43,12 @@ def write_products(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as unfinished:
-            for name, write in writers.items():
-                _write(write, Path(unfinished) / name, folder / name)
+            with ThreadPoolExecutor(_WRITERS_AT_ONCE) as pool:
+                written = [
+                    pool.submit(_write, w, Path(unfinished) / name, folder / name) for name, w in writers.items()
+                ]
+            for product in written:
+                product.result()
             for name in writers:
                 (Path(unfinished) / name).replace(folder / name)
     except OSError as error:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from rasterio import Affine
 from rasterio.enums import ColorInterp
-from rasterio.transform import from_origin
 
 from common.arrays import F32, F64, U8, Bool
 from common.export.projection import UtmProjection
@@ -187,7 +187,7 @@ def _write_cog(
         dtype=bands.dtype.name,
         nodata=nodata,
         crs=f"EPSG:{grid.projection.epsg}",
-        transform=from_origin(grid.west, grid.north, grid.pixel, grid.pixel),
+        transform=Affine(grid.pixel, 0.0, grid.west, 0.0, -grid.pixel, grid.north),
     ) as raster:
         if colours:
             raster.colorinterp = colours

@@ -1,0 +1,67 @@
+"""The `luojia-air` command: process, run."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from common import log
+from common.config import load
+from common.errors import LuojiaError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit code: 0 done, 1 an error that one line on stderr explains, 2 wrong usage."""
+    args = _parser().parse_args(arguments)
+    try:
+        code: int = args.run(args)
+    except LuojiaError as error:
+        print(f"luojia-air: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="luojia-air", description="Turn a flight into a georeferenced 3D map.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    process = commands.add_parser("process", help="map a recorded or simulated flight in one go and write files")
+    process.add_argument("source", metavar="SOURCE", help="photos:DIR or sim:survey?seed=1&photos=60")
+    process.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    process.add_argument("--quiet", action="store_true", help="no progress bar")
+    process.set_defaults(run=_process)
+
+    run = commands.add_parser("run", help="fly: map a source as it comes and send the map to the ground")
+    run.add_argument("--source", metavar="SOURCE", help="instead of the configuration's")
+    run.set_defaults(run=_run)
+
+    for command in (process, run):
+        command.add_argument("--config", type=Path, metavar="FILE", help="TOML file; without it the defaults hold")
+    return parser
+
+
+def _process(args: argparse.Namespace) -> int:
+    from air.config import AirConfig
+    from air.process import process  # gtsam and numba take seconds to import; wrong usage is told at once
+
+    report = process(load(args.config, AirConfig), args.source, args.out, args.quiet)
+    for problem in report.problems:
+        print(f"{problem['photo']}: {problem['state']}: {problem['reason']}", file=sys.stderr)
+    placed, read = report.photos["placed"], report.photos["read"]
+    print(f"{placed} of {read} photos, {report.area_m2:.0f} m² in {report.wall_s:.1f} s: {args.out}")
+    return 0
+
+
+def _run(args: argparse.Namespace) -> int:
+    from air.config import AirConfig
+    from air.nodes import fly
+
+    log.setup()
+    return fly(load(args.config, AirConfig), args.source)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

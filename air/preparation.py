@@ -1,0 +1,57 @@
+"""Reading and preparing photos ahead of the one in work, so that both cores are busy."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from air.alignment.prepare import PreparedPhoto, prepare
+from air.alignment.settings import AlignmentSettings
+from common.messages import Photo
+
+AHEAD = 6
+WORKERS = 2
+
+
+def prepared(photos: Iterable[Photo], settings: AlignmentSettings) -> Iterator[PreparedPhoto]:
+    """The photos in their order, each prepared by a pool of threads while earlier ones are worked on.
+
+    At most a few are held at a time, so a long flight needs no more memory. An error of the source is raised here.
+    """
+    waiting: queue.Queue[Future[PreparedPhoto] | BaseException | None] = queue.Queue(AHEAD)
+    stop = threading.Event()
+    with ThreadPoolExecutor(WORKERS, "prepare") as pool:
+
+        def read() -> None:
+            try:
+                for photo in photos:
+                    if not _put(waiting, pool.submit(prepare, photo, settings), stop):
+                        return
+                _put(waiting, None, stop)
+            except BaseException as error:
+                _put(waiting, error, stop)
+
+        reader = threading.Thread(target=read, name="reader", daemon=True)
+        reader.start()
+        try:
+            while (item := waiting.get()) is not None:
+                if isinstance(item, BaseException):
+                    raise item
+                yield item.result()
+        finally:
+            stop.set()
+            reader.join()
+
+
+def _put(
+    waiting: queue.Queue[Future[PreparedPhoto] | BaseException | None], item: object, stop: threading.Event
+) -> bool:
+    while not stop.is_set():
+        try:
+            waiting.put(item, timeout=0.1)  # type: ignore[arg-type]
+        except queue.Full:
+            continue
+        return True
+    return False

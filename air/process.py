@@ -1,0 +1,87 @@
+"""Processing a flight in one go: source → alignment → final adjustment → map → files. No bus, no clock in the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tqdm import tqdm
+
+from air.alignment.alignment import Alignment
+from air.config import AirConfig
+from air.mapping.mapper import Mapper
+from air.preparation import prepared
+from air.report import Report, Stopwatch, counts, known_cells, peak_memory, problems_of
+from air.sources.source import Source, open_source
+from common.errors import SourceError
+from common.export.products import write_products
+from common.messages import Datum, Keyframe, MapTile
+
+CHUNK = 10
+
+
+def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Report:
+    """Map of a source, written as standard files with a report into a folder.
+
+    Raises SourceError when the source cannot be opened or none of its photos could be placed, and ExportError.
+    """
+    watch = Stopwatch()
+    source = open_source(url)
+    alignment, mapper = Alignment("offline", config.alignment), Mapper(config.mapping)
+    with watch.stage("alignment"):
+        _align(source, alignment, mapper, config, quiet)
+    with watch.stage("adjustment"):
+        keyframes = alignment.finish()
+    if alignment.datum is None:
+        raise SourceError(f"{url}: none of {len(source)} photos could be placed: {_why(alignment, source)}")
+    with watch.stage("mapping"):
+        tiles = _map(keyframes, mapper, alignment, quiet)
+    with watch.stage("export"):
+        _write(out, source, alignment.datum, tiles, keyframes)
+    report = _report(source, alignment, tiles, config, watch)
+    report.write(out / "report.json")
+    return report
+
+
+def _align(source: Source, alignment: Alignment, mapper: Mapper, config: AirConfig, quiet: bool) -> None:
+    photos = prepared(source, config.alignment)
+    for index, photo in enumerate(tqdm(photos, "aligning", len(source), unit="photo", disable=quiet)):
+        alignment.add(photo)
+        if photo.image is not None:
+            mapper.add_image(index, photo.image)
+
+
+def _map(keyframes: list[Keyframe], mapper: Mapper, alignment: Alignment, quiet: bool) -> list[MapTile]:
+    with tqdm(desc="mapping", total=len(keyframes), unit="photo", disable=quiet) as bar:
+        for start in range(0, len(keyframes), CHUNK):
+            chunk = keyframes[start : start + CHUNK]
+            mapper.update(alignment.flight, chunk, alignment.ground_height())
+            bar.update(len(chunk))
+    return mapper.tiles()
+
+
+def _write(out: Path, source: Source, datum: Datum, tiles: list[MapTile], keyframes: list[Keyframe]) -> None:
+    write_products(out, datum, tiles, keyframes)
+    if source.truth is not None:
+        source.truth.write(out / "truth")
+
+
+def _why(alignment: Alignment, source: Source) -> str:
+    problems = problems_of(alignment.statuses(), source.problems)
+    return "; ".join(f"{p['photo']}: {p['reason']}" for p in problems[:3]) + ("; …" if len(problems) > 3 else "")
+
+
+def _report(source: Source, alignment: Alignment, tiles: list[MapTile], config: AirConfig, watch: Stopwatch) -> Report:
+    cells = known_cells(tiles)
+    return Report(
+        source=source.url,
+        photos=counts(alignment.statuses()),
+        problems=problems_of(alignment.statuses(), source.problems),
+        cameras=alignment.cameras,
+        reprojection_rms_px=alignment.residual_px(),
+        tiles=len(tiles),
+        cells=cells,
+        area_m2=cells * config.mapping.cell**2,
+        stages_s={name: round(s, 3) for name, s in watch.stages.items()},
+        wall_s=round(watch.total, 3),
+        peak_memory_bytes=peak_memory(),
+    )
