@@ -68,6 +68,17 @@ def test_colour_comes_from_the_agreeing_photo_nearest_to_its_image_centre():
     assert (fuse(stack, CELL, N).colour == 20).all()
 
 
+def test_layer_that_is_a_little_wrong_as_a_whole_raises_sigma_instead_of_a_dispute():
+    right = [flat_layer((0, 1), 1.0), flat_layer((1, 2), 1.0)]
+    fused = fuse([*right, flat_layer((4, 5), 1.15), flat_layer((5, 6), 1.15)], CELL, N)
+    assert not fused.disputed.any()
+    assert (fused.views == 6).all()
+    np.testing.assert_allclose(fused.height, 1.075, atol=0.08)
+    assert fused.sigma.min() > 1.3 * fuse(right, CELL, N).sigma.max()
+    # What is metres off stays a dispute.
+    assert fuse([*right, flat_layer((4, 5), 3.0), flat_layer((5, 6), 3.0)], CELL, N).disputed.all()
+
+
 def test_no_layers_give_an_unknown_surface():
     fused = fuse([], CELL, N)
     assert np.isnan(fused.height).all()

@@ -97,8 +97,9 @@ def test_semi_global_search_is_as_good(photos):
     assert np.median(np.abs(error[(views >= 3) & ~disputed])) < 0.01
 
 
-def test_result_is_the_same_twice_and_with_more_threads(photos, whole):
-    again = filled(photos, replace(SETTINGS, threads=2)).update("flight", FRAMES)
+@pytest.mark.parametrize("change", [{"threads": 2}, {"revisable": False}])
+def test_result_is_the_same_twice_with_more_threads_and_without_memory(photos, whole, change):
+    again = filled(photos, replace(SETTINGS, **change)).update("flight", FRAMES)
     assert [t.id for t in again] == [t.id for t in whole]
     for a, b in zip(whole, again, strict=True):
         np.testing.assert_array_equal(a.height, b.height)

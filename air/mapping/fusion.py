@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from air.mapping.layer import Layer
-from common.arrays import F32, I32, U8, Bool
+from common.arrays import F16, F32, F64, I32, U8, Bool
 
 # Heights agree within this many standard deviations of their difference, and a quarter of a cell.
 AGREEMENT_SIGMAS = 3.0
@@ -18,6 +18,11 @@ AGREEMENT_CELLS = 0.25
 MAX_OUTLIER_SHARE = 1 / 3
 # Of two surfaces that are nearly as well supported a surface model shows the upper one.
 UPPER_SUPPORT = 0.9
+CLEAR_MAJORITY = 0.7
+# A layer's sigma is raised to what its heights show, but a layer that is plainly wrong stays in dispute.
+MAX_EXCESS = 4.0
+MIN_COMMON_CELLS = 100
+MEDIAN_TO_SIGMA = 1.4826
 # The part of a pair's sigma that all pairs share (poses adjusted together), so that averaging does not lower it.
 COMMON_SHARE = 0.3
 
@@ -47,6 +52,9 @@ def fuse(layers: Sequence[Layer], cell: float, tile_cells: int) -> Surface:
         height[k][part], sigma[k][part], radius[k][part] = layer.height, layer.sigma, layer.radius
     numbers = {photo: n for n, photo in enumerate(sorted({p for layer in layers for p in layer.photos}))}
     photos = np.array([[numbers[p] for p in layer.photos] for layer in layers], np.int32).reshape(-1, 2)
+    first, *_ = _fuse(height, sigma, radius, photos, AGREEMENT_CELLS * cell)
+    for k, layer in enumerate(layers):
+        sigma[k] *= _excess(height[k][_part(layer)], first[_part(layer)], layer.sigma)
     fused, deviation, views, disputed, source = _fuse(height, sigma, radius, photos, AGREEMENT_CELLS * cell)
     colour = np.zeros((tile_cells, tile_cells, 3), np.uint8)
     for k, layer in enumerate(layers):
@@ -54,6 +62,19 @@ def fuse(layers: Sequence[Layer], cell: float, tile_cells: int) -> Surface:
         best = source[part] == k
         colour[part][best] = layer.colour[best]
     return Surface(fused, deviation, colour, views, disputed)
+
+
+def _excess(height: F32, fused: F32, sigma: F16) -> float:
+    """How many times more than predicted a layer differs from what all agree on, within [1, MAX_EXCESS].
+
+    What a pose that is a little wrong does to a whole layer is no dispute about its cells.
+    """
+    difference = np.abs(height - fused)
+    difference = difference[difference > 0]
+    if len(difference) < MIN_COMMON_CELLS:
+        return 1.0
+    ratio = MEDIAN_TO_SIGMA * float(np.median(difference)) / float(np.nanmedian(sigma.astype(np.float32)))
+    return float(np.clip(ratio, 1.0, MAX_EXCESS))
 
 
 def _part(layer: Layer) -> tuple[slice, slice]:
@@ -83,15 +104,7 @@ def _fuse(heights: F32, sigmas: F32, radii: F32, photos: I32, floor: float) -> t
                     n += 1
             if n == 0:
                 continue
-            best, best_support = 0, 0.0
-            for i in range(n):
-                support = 0.0
-                for j in range(n):
-                    if abs(z[j] - z[i]) <= AGREEMENT_SIGMAS * np.sqrt(sigma[i] ** 2 + sigma[j] ** 2) + floor:
-                        support += weight[j]
-                higher = z[i] > z[best]
-                if support > best_support * (UPPER_SUPPORT if higher else 1 / UPPER_SUPPORT):
-                    best, best_support = i, support
+            best = _consensus(z[:n], sigma[:n], weight[:n], floor)
             total, mean, inliers = 0.0, 0.0, 0
             for i in range(n):
                 limit = AGREEMENT_SIGMAS * np.sqrt(sigma[i] ** 2 + sigma[best] ** 2) + floor
@@ -121,3 +134,34 @@ def _fuse(heights: F32, sigmas: F32, radii: F32, photos: I32, floor: float) -> t
             deviation[row, column] = np.sqrt(variance)
             disputed[row, column] = n - inliers > MAX_OUTLIER_SHARE * n
     return height, deviation, views, disputed, source
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _consensus(z: F64, sigma: F64, weight: F64, floor: float) -> int:
+    """Index of the height that most of the weight agrees with; of two that are nearly equal in that, the upper one."""
+    order = np.argsort(z)
+    half, total = 0.0, weight.sum()
+    middle = order[-1]
+    for i in order:
+        half += weight[i]
+        if half >= 0.5 * total:
+            middle = i
+            break
+    # Where a clear majority agrees with the weighted median nothing else can win: the search is for the rest.
+    if _support(middle, z, sigma, weight, floor) > CLEAR_MAJORITY * total:
+        return int(middle)
+    best, best_support = order[0], 0.0
+    for i in order:
+        support = _support(i, z, sigma, weight, floor)
+        if support > UPPER_SUPPORT * best_support:
+            best, best_support = i, max(support, best_support)
+    return int(best)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _support(i: int, z: F64, sigma: F64, weight: F64, floor: float) -> float:
+    support = 0.0
+    for j in range(len(z)):
+        if abs(z[j] - z[i]) <= AGREEMENT_SIGMAS * np.sqrt(sigma[i] ** 2 + sigma[j] ** 2) + floor:
+            support += weight[j]
+    return support

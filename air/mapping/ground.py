@@ -20,7 +20,7 @@ KNOWN_BELOW, KNOWN_ABOVE = 0.08, 0.22
 # Heights tried, in baselines, when not even the order of magnitude is known.
 HEIGHTS_IN_BASELINES = (2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 ESTIMATE_PIXELS = 40_000
-ESTIMATE_SHARE = 0.25
+ESTIMATE_SHARE = 0.10
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,7 @@ class Mapper:
         self._settings = settings or MappingSettings()
         self._images: dict[int, U8] = {}
         self._keyframes: dict[int, Keyframe] = {}
+        self._tried: set[Photos] = set()
         self._contributions: dict[Photos, Contribution] = {}
         self._ground = Ground()
         self._tiles = Tiles(self._settings.cell, self._settings.tile_cells)
@@ -122,7 +123,9 @@ class Mapper:
                 self._ground.suppose(ground)
             for partner in choose_partners(keyframe, with_image, ground, self._settings):
                 pairs[min(index, partner.index), max(index, partner.index)] = None
-        return [p for p in pairs if p not in self._contributions]
+        untried = [p for p in pairs if p not in self._tried]
+        self._tried.update(untried)
+        return untried
 
     def _matched(self, pairs: Sequence[Photos]) -> dict[Photos, Contribution]:
         """What the new pairs give; each is matched on its own, so threads change nothing but the time."""
@@ -154,7 +157,8 @@ class Mapper:
             found = list(pool.map(self._layers, contributions, contributions.values()))
         touched: set[TileId] = set()
         for (photos, contribution), stack in zip(contributions.items(), found, strict=True):
-            self._contributions[photos] = contribution
+            if self._settings.revisable:
+                self._contributions[photos] = contribution
             self._ground.learn(photos, contribution.samples)
             touched |= self._tiles.replace(photos, stack)
         return touched

@@ -18,7 +18,8 @@ class MappingSettings:
     footprint. `images_kept` working copies of at most `image_pixels` px stay in memory, and a pair is matched on a
     grid of at most `match_pixels` px. A pair is triangulated again when new poses or intrinsics move its surface by
     more than `move_tolerance`, at most `moves_per_update` pairs at a time, those that moved most first. `threads` pairs
-    are worked on at once; the result does not depend on it.
+    are worked on at once; the result does not depend on it. Without `revisable` nothing is kept to triangulate pairs
+    anew: half the memory, for poses that are final.
     """
 
     cell: float = 0.10
@@ -35,6 +36,7 @@ class MappingSettings:
     move_tolerance: float = 0.03
     moves_per_update: int = 16
     threads: int = 2
+    revisable: bool = True
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a value that no map can be made with."""
