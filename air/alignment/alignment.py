@@ -24,7 +24,7 @@ from common.se3 import SE3
 THUMBNAIL_PX = 320
 CALIBRATE_SPREAD = 0.15
 """Extent of the block across its strips from which the intrinsics are adjusted: one strip leaves them undetermined."""
-FINAL_ROUNDS = 2
+FINAL_ROUNDS, FINAL_OBSERVATIONS = 2, 60_000
 LOCAL_FREE = 6
 LOCAL_FIXED = 12
 MIN_PAIR_ANGLE_DEG = 2.0
@@ -207,7 +207,7 @@ class Alignment:
                 component = self._attach(i)
             if component is not None:
                 self._merge_into(component, i)
-                block.triangulate([i], self.settings.resection_px)
+                block.triangulate([i])
                 self._adjust_around(i)
                 return True
         return False
@@ -293,9 +293,9 @@ class Alignment:
         self._components += 1
         block.place(a, similarity.pose(SE3.identity()), component)
         block.place(b, similarity.pose(T_a_b), component)
-        block.triangulate([a, b], self.settings.resection_px)
-        block.adjust([a, b], [], calibrate=False, per_photo=self.settings.observations_per_photo, want_sigma=False)
-        block.prune([a, b], self.settings.resection_px)
+        block.triangulate([a, b])
+        block.adjust([a, b], [], calibrate=False, per_photo=self.settings.observations_per_photo, final=False)
+        block.prune([a, b])
         return True
 
     def _set_datum(self, photo: int) -> None:
@@ -318,11 +318,9 @@ class Alignment:
         order = sorted(shared, key=lambda i: -shared[i])
         free = [photo, *order[:LOCAL_FREE]]
         fixed = order[LOCAL_FREE : LOCAL_FREE + LOCAL_FIXED]
-        block.adjust(
-            free, fixed, calibrate=False, per_photo=self.settings.observations_per_photo // 2, want_sigma=False
-        )
-        block.prune(free, self.settings.resection_px)
-        block.triangulate(free, self.settings.resection_px)
+        block.adjust(free, fixed, calibrate=False, per_photo=self.settings.observations_per_photo // 2, final=False)
+        block.prune(free)
+        block.triangulate(free)
 
     def _adjust_if_due(self) -> None:
         if self.placed >= max(self._adjusted * self.settings.growth, self._adjusted + 1):
@@ -337,11 +335,11 @@ class Alignment:
         photos = sorted(block.poses)
         calibrate = self._spread() > CALIBRATE_SPREAD
         for _ in range(FINAL_ROUNDS if final else 1):
-            block.adjust(photos, [], calibrate, s.observations_per_photo, want_sigma=False)
-            block.retrack(self._matches, block.residual_limit_px())
+            block.adjust(photos, [], calibrate, s.observations_per_photo, final=False)
+            block.retrack(self._matches)
         if final:
-            block.adjust(photos, [], calibrate, 2 * s.observations_per_photo, want_sigma=True)
-            block.prune(photos, block.residual_limit_px())
+            block.adjust(photos, [], calibrate, FINAL_OBSERVATIONS // len(photos), final=True)
+            block.prune(photos)
 
     def _spread(self) -> float:
         """Extent of the block across its longest direction, in heights above ground (one sigma)."""

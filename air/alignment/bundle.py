@@ -25,7 +25,11 @@ noise = gtsam.noiseModel
 UNTIED = 1e-6
 """fx and fy are one focal length: their difference may not exceed about this, widths."""
 FIXED, UNKNOWN = 1e-7, 1e6
+POINT_SIGMA = 100.0
+"""Weak prior of a point, m: keeps the system regular when a step takes a point behind its cameras."""
 HUBER = 1.345
+LM_ITERATIONS, LM_TOLERANCE = 40, 1e-3
+GN_ITERATIONS, GN_TOLERANCE = 10, 1e-5
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -58,7 +62,8 @@ class BundleProblem:
     """N photos, P points, M observations.
 
     `camera_of` (N,) indexes `cameras`; `fixed` (N,) marks poses that stay; `photo` and `point` (M,) say who saw what
-    at `uv` (M, 2) px with `pixel_sigma`; intrinsics move only if `calibrate`.
+    at `uv` (M, 2) px with `pixel_sigma`; intrinsics move only if `calibrate`. With `final` the observations are
+    taken to be free of outliers and count by their squares, and the sigmas of the positions are computed.
     """
 
     cameras: Sequence[CameraModel]
@@ -73,7 +78,7 @@ class BundleProblem:
     uv: F64
     pixel_sigma: float
     calibrate: bool
-    want_sigma: bool = False
+    final: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,24 +92,58 @@ class BundleSolution:
     iterations: int
 
 
-def adjust(problem: BundleProblem, max_iterations: int) -> BundleSolution:
+def adjust(problem: BundleProblem) -> BundleSolution:
     """The adjusted problem. Raises RuntimeError (of gtsam) when the system is singular."""
     graph, values = _observations(problem)
     _add_pose_priors(graph, problem)
     _add_camera_priors(graph, problem)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(max_iterations)
-    parameters.setRelativeErrorTol(1e-5)
-    parameters.setOrdering(_points_first(problem))
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-    result = optimizer.optimize()
+    ordering = _points_first(problem)
+    result, iterations = _levenberg_marquardt(graph, values, ordering)
+    if problem.calibrate:
+        result, more = _gauss_newton(graph, result, ordering)
+        iterations += more
     return BundleSolution(
         cameras=[_from_gtsam(result.atCal3DS2(K(i)), c) for i, c in enumerate(problem.cameras)],
         poses=[_se3(result.atPose3(X(i))) for i in range(len(problem.poses))],
         points=np.array([result.atPoint3(L(j)) for j in range(len(problem.points))]).reshape(-1, 3),
-        sigma=_position_sigma(graph, result, problem) if problem.want_sigma else None,
-        iterations=optimizer.iterations(),
+        sigma=_position_sigma(graph, result, problem) if problem.final else None,
+        iterations=iterations,
     )
+
+
+def _levenberg_marquardt(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
+) -> tuple[gtsam.Values, int]:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(LM_ITERATIONS)
+    parameters.setRelativeErrorTol(LM_TOLERANCE)
+    parameters.setOrdering(ordering)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    return optimizer.optimize(), optimizer.iterations()
+
+
+def _gauss_newton(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, ordering: gtsam.Ordering
+) -> tuple[gtsam.Values, int]:
+    """The minimum along the curved valley in which focal length and height make up for each other.
+
+    A step along it may first raise the error, so a method that accepts only descent creeps; undamped steps arrive in
+    three or four. What does not end below the start is given up.
+    """
+    values, before = start, graph.error(start)
+    best, least = start, before
+    for iteration in range(GN_ITERATIONS):
+        try:
+            values = values.retract(graph.linearize(values).optimize(ordering))
+        except RuntimeError:  # a step that went too far left the system singular
+            return best, iteration
+        error = graph.error(values)
+        if error < least:
+            best, least = values, error
+        if abs(before - error) < GN_TOLERANCE * error:
+            return best, iteration + 1
+        before = error
+    return best, GN_ITERATIONS
 
 
 def _points_first(problem: BundleProblem) -> gtsam.Ordering:
@@ -125,14 +164,18 @@ def _observations(problem: BundleProblem) -> tuple[gtsam.NonlinearFactorGraph, g
         values.insert(X(i), gtsam.Pose3(gtsam.Rot3(T.R), T.t))
     for i, camera in enumerate(problem.cameras):
         values.insert(K(i), _to_gtsam(camera))
+    anywhere = noise.Isotropic.Sigma(3, POINT_SIGMA)
     for j, p in enumerate(problem.points):
         values.insert(L(j), p)
+        graph.add(gtsam.PriorFactorPoint3(L(j), p, anywhere))
     width = np.array([camera.width for camera in problem.cameras])[problem.camera_of]
-    robust = [_robust(noise.Isotropic.Sigma(2, problem.pixel_sigma / camera.width)) for camera in problem.cameras]
+    model = [noise.Isotropic.Sigma(2, problem.pixel_sigma / camera.width) for camera in problem.cameras]
+    if not problem.final:
+        model = [_robust(m) for m in model]
     camera_of = problem.camera_of
     uv_widths = problem.uv / width[problem.photo][:, None]
     for i, j, uv in zip(problem.photo.tolist(), problem.point.tolist(), uv_widths, strict=True):
-        graph.add(gtsam.GeneralSFMFactor2Cal3DS2(uv, robust[camera_of[i]], X(i), L(j), K(camera_of[i])))
+        graph.add(gtsam.GeneralSFMFactor2Cal3DS2(uv, model[camera_of[i]], X(i), L(j), K(camera_of[i])))
     return graph, values
 
 

@@ -90,15 +90,15 @@ def _refine(
     factors = np.ones(3)
     for _ in range(ITERATIONS):
         arm = scale * free @ R.T
-        residual = arm + centre - fixes
+        residual: F64 = arm + centre - fixes
         factors = _factors(residual / sigma)
         J, r = _position_rows(arm, residual, sigma * factors)
         J_att, r_att = _attitude_rows(R, poses, priors)
         J, r = np.vstack([J, J_att]), np.concatenate([r, r_att])
-        step: F64 = np.linalg.lstsq(J, -r, rcond=None)[0]
+        step = np.asarray(np.linalg.lstsq(J, -r, rcond=None)[0], np.float64)
         R = rotation_vector_to_matrix(step[:3]) @ R
         scale *= float(np.exp(np.clip(step[3], -0.5, 0.5)))
-        centre = centre + step[4:]
+        centre = np.asarray(centre + step[4:], np.float64)
     similarity = Similarity(scale, R, centre - scale * (R @ middle))
     return Georeference(similarity, float(factors[0]), float(factors[2]))
 

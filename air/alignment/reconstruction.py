@@ -17,7 +17,6 @@ from common.camera import CameraModel
 from common.se3 import SE3
 
 TRIALS = 3
-ITERATIONS, FINAL_ITERATIONS = 15, 40
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a two-dimensional error of sigma one."""
 MIN_VIEWS = 2
@@ -27,7 +26,8 @@ MIN_VIEWS = 2
 class Reconstruction:
     """Photos by index, points by track; photos of one `component` share points, all lie in the world frame.
 
-    `scale_of` gives full-image px per working px of a photo: the settings' px count on the working image.
+    `scale_of` gives full-image px per working px of a photo: the settings' px count on the working image, as does
+    `limit_px`, the residual beyond which an observation is taken for an outlier.
     """
 
     settings: AlignmentSettings
@@ -42,6 +42,10 @@ class Reconstruction:
     sigmas: dict[int, F64] = field(default_factory=dict)
     component: dict[int, int] = field(default_factory=dict)
     points: dict[int, F64] = field(default_factory=dict)
+    limit_px: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.limit_px = self.settings.resection_px
 
     def add_photo(self, photo: int, uv: F64, scale: float, camera: CameraModel, prior: PosePrior) -> None:
         """Make a photo known: its features (N, 2) px, its camera's first guess, and what is known of its pose."""
@@ -116,17 +120,17 @@ class Reconstruction:
         placed = [i for i in self.tracks.members(track) if i in self.component]
         return self.component[placed[0]] if placed else -1
 
-    def triangulate(self, photos: Iterable[int], limit_px: float) -> None:
+    def triangulate(self, photos: Iterable[int]) -> None:
         """Give points to the tracks of placed photos that have none yet and are seen from far enough apart.
 
-        An observation that misses the point by more than the limit (working px) is the worst of its track and leaves
-        it; the rest is tried again.
+        An observation that misses the point by more than `limit_px` and more than the others of its track leaves it;
+        the rest is tried again.
         """
         tracks = {t for i in photos for t in np.unique(self.tracks.of(i)).tolist() if t >= 0 and t not in self.points}
         for _ in range(TRIALS):
-            tracks = self._triangulate(sorted(tracks), limit_px)
+            tracks = self._triangulate(sorted(tracks))
 
-    def _triangulate(self, tracks: list[int], limit_px: float) -> set[int]:
+    def _triangulate(self, tracks: list[int]) -> set[int]:
         """Set the points of tracks on which all observations agree; the tracks that lost one and may do now."""
         photo, feature, point = self._observations(tracks)
         if not len(photo):
@@ -144,11 +148,11 @@ class Reconstruction:
             errors[rows] = error / self.scale_of[i]
         worst = np.zeros(len(tracks))
         np.maximum.at(worst, point, errors)
-        good = (worst < limit_px) & (angle > np.radians(self.settings.min_angle_deg))
+        good = (worst < self.limit_px) & (angle > np.radians(self.settings.min_angle_deg))
         for j in np.flatnonzero(good).tolist():
             self.points[tracks[j]] = points[j]
         again = set()
-        for row in np.flatnonzero((errors >= limit_px) & (errors == worst[point])).tolist():
+        for row in np.flatnonzero((errors >= self.limit_px) & (errors == worst[point])).tolist():
             track = tracks[point[row]]
             if len(self.tracks.members(track)) > MIN_VIEWS:
                 self.tracks.drop(track, int(photo[row]))
@@ -168,17 +172,18 @@ class Reconstruction:
         photo, feature, point = np.array(rows, np.int64).reshape(-1, 3).T
         return photo, feature, point
 
-    def retrack(self, matches: dict[tuple[int, int], I64], limit_px: float) -> None:
+    def retrack(self, matches: dict[tuple[int, int], I64]) -> None:
         """Form all tracks and points again from the matches: poses are better now, so good matches come back."""
+        self.limit_px = self._judge()
         self.tracks = Tracks()
         self.points = {}
         for photo, uv in self.uv.items():
             self.tracks.add_photo(photo, len(uv))
         for (a, b), pairs in matches.items():
             self.tracks.link(a, b, pairs)
-        self.triangulate(self.poses, limit_px)
+        self.triangulate(self.poses)
 
-    def adjust(self, free: list[int], fixed: list[int], calibrate: bool, per_photo: int, want_sigma: bool) -> None:
+    def adjust(self, free: list[int], fixed: list[int], calibrate: bool, per_photo: int, final: bool) -> None:
         """Adjust the poses of `free` photos and the points that they see, held by `fixed` photos; drop outliers."""
         photos = [*free, *fixed]
         tracks = select_tracks(self, photos, per_photo)
@@ -206,9 +211,8 @@ class Reconstruction:
                     uv=uv,
                     pixel_sigma=self.settings.pixel_sigma * scale,
                     calibrate=calibrate,
-                    want_sigma=want_sigma,
-                ),
-                FINAL_ITERATIONS if want_sigma else ITERATIONS,
+                    final=final,
+                )
             )
         except RuntimeError:
             # gtsam names an undetermined point or pose: keep what is there, the next photo adds what is missing.
@@ -225,10 +229,10 @@ class Reconstruction:
             del self.points[t]
         for t, p in zip(tracks, solution.points, strict=True):
             self.points[t] = p
-        self.triangulate(free, self.settings.resection_px)
+        self.triangulate(free)
 
-    def prune(self, photos: Iterable[int], limit_px: float) -> int:
-        """Drop the observations of photos that miss their point by more than a limit (working px), and lone points.
+    def prune(self, photos: Iterable[int]) -> int:
+        """Drop the observations of photos that miss their point by more than `limit_px`, and lone points.
 
         Returns how many were dropped.
         """
@@ -239,14 +243,14 @@ class Reconstruction:
                 continue
             p = np.array([self.points[t] for t in tracks])
             error = reprojection_error(self.camera(photo), self.poses[photo], p, self.uv[photo][features])
-            for k in np.flatnonzero(error > limit_px * self.scale_of[photo]).tolist():
+            for k in np.flatnonzero(error > self.limit_px * self.scale_of[photo]).tolist():
                 self.tracks.drop(tracks[k], photo)
                 dropped += 1
                 if sum(i in self.poses for i in self.tracks.members(tracks[k])) < 2:
                     del self.points[tracks[k]]
         return dropped
 
-    def residual_limit_px(self) -> float:
+    def _judge(self) -> float:
         """Residual, working px, beyond which an observation is an outlier: four robust sigmas, within the settings."""
         errors = self.residuals_px() / np.median(list(self.scale_of.values()))
         sigma = float(np.median(errors)) / RAYLEIGH_MEDIAN if len(errors) else 0.0

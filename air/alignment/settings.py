@@ -22,7 +22,7 @@ class AlignmentSettings:
     resection_px: float = 8.0
     min_angle_deg: float = 1.5
     pixel_sigma: float = 0.4
-    max_residual_px: float = 2.0
+    max_residual_px: float = 1.0
     observations_per_photo: int = 350
     focal_sigma: float = 0.2
     principal_sigma: float = 0.01
