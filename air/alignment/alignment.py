@@ -95,8 +95,8 @@ class Alignment:
 
     def ground_height(self) -> float | None:
         """Median height of the points of the ground, m in world; None while there are none."""
-        points = self._block.points
-        return float(np.median([p[2] for p in points.values()])) if points else None
+        points = self._block.points.all()
+        return float(np.median(points[:, 2])) if len(points) else None
 
     @property
     def placed(self) -> int:
@@ -311,7 +311,7 @@ class Alignment:
         """Adjust a new photo and those that share most with it, held by the next ones."""
         block = self._block
         shared: dict[int, int] = {}
-        for track in block.seen_points(photo)[1]:
+        for track in block.seen_points(photo)[1].tolist():
             for i in block.tracks.members(track):
                 if i in block.poses and i != photo:
                     shared[i] = shared.get(i, 0) + 1
@@ -357,12 +357,11 @@ class Alignment:
         if fit is None:
             return
         worse = np.array([fit.horizontal_factor, fit.horizontal_factor, fit.vertical_factor])
-        tracks = {t for i in photos for t in block.seen_points(i)[1]}
+        tracks = block.tracks_of(photos)
         for i, prior in zip(photos, priors, strict=True):
             block.priors[i] = replace(prior, p_sigma=prior.p_sigma * worse)
             block.poses[i] = fit.similarity.pose(block.poses[i])
-        for t in tracks:
-            block.points[t] = fit.similarity.points(block.points[t])
+        block.points.put(tracks, fit.similarity.points(block.points.at(tracks)))
 
     def _moved(self, threshold: float) -> list[Keyframe]:
         """Keyframes of the photos whose ground has moved by more than a threshold, m, since they were last given."""

@@ -28,7 +28,7 @@ FIXED, UNKNOWN = 1e-7, 1e6
 POINT_SIGMA = 100.0
 """Weak prior of a point, m: keeps the system regular when a step takes a point behind its cameras."""
 HUBER = 1.345
-LM_ITERATIONS, LM_TOLERANCE = 40, 1e-3
+LM_ITERATIONS, LM_TOLERANCE = 8, 1e-3
 GN_ITERATIONS, GN_TOLERANCE = 10, 1e-5
 DOWN = np.array([0.0, 0.0, -1.0])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from air.alignment.bundle import BundleProblem, BundleSolution, CameraPrior, PosePrior, adjust
 from air.alignment.geometry import reprojection_error, resect, triangulate
+from air.alignment.points import Points
 from air.alignment.selection import select_tracks
 from air.alignment.settings import AlignmentSettings
 from air.alignment.tracks import Tracks
@@ -41,7 +43,7 @@ class Reconstruction:
     poses: dict[int, SE3] = field(default_factory=dict)
     sigmas: dict[int, F64] = field(default_factory=dict)
     component: dict[int, int] = field(default_factory=dict)
-    points: dict[int, F64] = field(default_factory=dict)
+    points: Points = field(default_factory=Points)
     limit_px: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -72,19 +74,23 @@ class Reconstruction:
         """The placed photos of a component, in order."""
         return sorted(i for i, c in self.component.items() if c == component)
 
-    def seen_points(self, photo: int) -> tuple[list[int], list[int]]:
-        """Features of a photo whose track has a point, and those tracks."""
+    def seen_points(self, photo: int) -> tuple[I64, I64]:
+        """Features (K,) of a photo whose track has a point, and those tracks (K,)."""
         of = self.tracks.of(photo)
-        features = [f for f in np.flatnonzero(of >= 0).tolist() if int(of[f]) in self.points]
-        return features, [int(of[f]) for f in features]
+        features = np.flatnonzero(self.points.known(of))
+        return features, of[features]
+
+    def tracks_of(self, photos: Iterable[int]) -> I64:
+        """Tracks (K,) with a point that any of the photos sees."""
+        seen = [self.seen_points(i)[1] for i in photos]
+        return np.unique(np.concatenate(seen)) if seen else np.zeros(0, np.int64)
 
     def depth(self, photo: int) -> float:
         """Median distance along the optical axis of the points that a placed photo sees, m; 0 when it sees none."""
         _, tracks = self.seen_points(photo)
-        if not tracks:
+        if not len(tracks):
             return 0.0
-        p = np.array([self.points[t] for t in tracks])
-        return float(np.median(self.poses[photo].inverse().apply(p)[:, 2]))
+        return float(np.median(self.poses[photo].inverse().apply(self.points.at(tracks))[:, 2]))
 
     def place(self, photo: int, pose: SE3, component: int) -> None:
         """Set the pose of a photo for the first time."""
@@ -93,27 +99,25 @@ class Reconstruction:
     def dissolve(self, component: int) -> None:
         """Take back the poses and points of a component; its photos can be placed again."""
         for photo in self.photos(component):
-            for track in self.seen_points(photo)[1]:
-                del self.points[track]
+            self.points.forget(self.seen_points(photo)[1])
             del self.poses[photo], self.component[photo]
 
     def resect(self, photo: int) -> int | None:
         """Place a photo on the points it shares with a component; the component, or None if too few agree."""
         features, tracks = self.seen_points(photo)
-        owner = [self._owner(t) for t in tracks]
-        for component in sorted(set(owner), key=owner.count, reverse=True):
-            mine = [k for k, o in enumerate(owner) if o == component]
+        owner = np.array([self._owner(t) for t in tracks.tolist()], np.int64)
+        components, supports = np.unique(owner, return_counts=True)
+        for component in components[np.argsort(-supports, kind="stable")].tolist():
+            mine = np.flatnonzero(owner == component)
             if len(mine) < self.settings.min_resection:
                 return None
-            p = np.array([self.points[tracks[k]] for k in mine])
-            uv = self.uv[photo][[features[k] for k in mine]]
+            p, uv = self.points.at(tracks[mine]), self.uv[photo][features[mine]]
             found = resect(self.camera(photo), p, uv, self.settings.resection_px * self.scale_of[photo])
             if found is not None and found[1].sum() >= self.settings.min_resection:
                 self.place(photo, found[0], component)
-                for k, inlier in zip(mine, found[1], strict=True):
-                    if not inlier:
-                        self.tracks.drop(tracks[k], photo)
-                return component
+                for track in tracks[mine[~found[1]]].tolist():
+                    self.tracks.drop(track, photo)
+                return int(component)
         return None
 
     def _owner(self, track: int) -> int:
@@ -126,15 +130,16 @@ class Reconstruction:
         An observation that misses the point by more than `limit_px` and more than the others of its track leaves it;
         the rest is tried again.
         """
-        tracks = {t for i in photos for t in np.unique(self.tracks.of(i)).tolist() if t >= 0 and t not in self.points}
+        seen = np.unique(np.concatenate([self.tracks.of(i) for i in photos]))
+        tracks = seen[(seen >= 0) & ~self.points.known(seen)]
         for _ in range(TRIALS):
-            tracks = self._triangulate(sorted(tracks))
+            tracks = self._triangulate(tracks)
 
-    def _triangulate(self, tracks: list[int]) -> set[int]:
+    def _triangulate(self, tracks: I64) -> I64:
         """Set the points of tracks on which all observations agree; the tracks that lost one and may do now."""
         photo, feature, point = self._observations(tracks)
         if not len(photo):
-            return set()
+            return np.zeros(0, np.int64)
         centres = np.array([self.poses[i].t for i in photo.tolist()])
         directions, errors = np.zeros((len(photo), 3)), np.full(len(photo), np.inf)
         groups = [(i, np.flatnonzero(photo == i)) for i in np.unique(photo).tolist()]
@@ -149,26 +154,28 @@ class Reconstruction:
         worst = np.zeros(len(tracks))
         np.maximum.at(worst, point, errors)
         good = (worst < self.limit_px) & (angle > np.radians(self.settings.min_angle_deg))
-        for j in np.flatnonzero(good).tolist():
-            self.points[tracks[j]] = points[j]
+        self.points.put(tracks[good], points[good])
         again = set()
         for row in np.flatnonzero((errors >= self.limit_px) & (errors == worst[point])).tolist():
-            track = tracks[point[row]]
+            track = int(tracks[point[row]])
             if len(self.tracks.members(track)) > MIN_VIEWS:
                 self.tracks.drop(track, int(photo[row]))
                 again.add(track)
-        return again
+        return np.array(sorted(again), np.int64)
 
-    def _observations(self, tracks: list[int]) -> tuple[I64, I64, I64]:
+    def _observations(self, tracks: I64) -> tuple[I64, I64, I64]:
         """Photo, feature and row of the track (M,) of all observations in the largest component that sees each."""
         rows = []
-        for j, track in enumerate(tracks):
-            placed = [(i, f) for i, f in self.tracks.members(track).items() if i in self.component]
-            owners = [self.component[i] for i, _ in placed]
-            if owners:
-                owner = max(set(owners), key=lambda c: (owners.count(c), -c))
-                mine = [(i, f, j) for (i, f), c in zip(placed, owners, strict=True) if c == owner]
-                rows += mine if len(mine) >= MIN_VIEWS else []
+        component = self.component
+        for j, track in enumerate(tracks.tolist()):
+            placed = [(i, f, j) for i, f in self.tracks.members(track).items() if i in component]
+            owners = {component[i] for i, _, _ in placed}
+            if len(owners) > 1:
+                count = Counter(component[i] for i, _, _ in placed)
+                owner = max(owners, key=lambda c: (count[c], -c))
+                placed = [row for row in placed if component[row[0]] == owner]
+            if len(placed) >= MIN_VIEWS:
+                rows += placed
         photo, feature, point = np.array(rows, np.int64).reshape(-1, 3).T
         return photo, feature, point
 
@@ -176,7 +183,7 @@ class Reconstruction:
         """Form all tracks and points again from the matches: poses are better now, so good matches come back."""
         self.limit_px = self._judge()
         self.tracks = Tracks()
-        self.points = {}
+        self.points = Points()
         for photo, uv in self.uv.items():
             self.tracks.add_photo(photo, len(uv))
         for (a, b), pairs in matches.items():
@@ -187,14 +194,17 @@ class Reconstruction:
         """Adjust the poses of `free` photos and the points that they see, held by `fixed` photos; drop outliers."""
         photos = [*free, *fixed]
         tracks = select_tracks(self, photos, per_photo)
+        row_of = {i: k for k, i in enumerate(photos)}
         rows = [
-            (k, j, self.tracks.members(t)[i])
-            for j, t in enumerate(tracks)
-            for k, i in enumerate(photos)
-            if i in self.tracks.members(t)
+            (row_of[i], j, f)
+            for j, t in enumerate(tracks.tolist())
+            for i, f in self.tracks.members(t).items()
+            if i in row_of
         ]
         photo, point, feature = np.array(rows, np.int64).reshape(-1, 3).T
-        uv = np.array([self.uv[photos[k]][f] for k, f in zip(photo, feature, strict=True)]).reshape(-1, 2)
+        uv = np.zeros((len(rows), 2))
+        for i, k in row_of.items():
+            uv[photo == k] = self.uv[i][feature[photo == k]]
         scale = float(np.median([self.scale_of[i] for i in photos]))
         try:
             solution = adjust(
@@ -205,7 +215,7 @@ class Reconstruction:
                     poses=[self.poses[i] for i in photos],
                     pose_priors=[self.priors[i] for i in photos],
                     fixed=np.array([False] * len(free) + [True] * len(fixed)),
-                    points=np.array([self.points[t] for t in tracks]).reshape(-1, 3),
+                    points=self.points.at(tracks),
                     photo=photo,
                     point=point,
                     uv=uv,
@@ -219,36 +229,24 @@ class Reconstruction:
             return
         self._accept(solution, free, photos, tracks)
 
-    def _accept(self, solution: BundleSolution, free: list[int], photos: list[int], tracks: list[int]) -> None:
+    def _accept(self, solution: BundleSolution, free: list[int], photos: list[int], tracks: I64) -> None:
         self.cameras = list(solution.cameras)
         for k, i in enumerate(photos[: len(free)]):
             self.poses[i] = solution.poses[k]
             if solution.sigma is not None:
                 self.sigmas[i] = solution.sigma[k]
-        for t in {t for i in free for t in self.seen_points(i)[1]}:
-            del self.points[t]
-        for t, p in zip(tracks, solution.points, strict=True):
-            self.points[t] = p
+        self.points.forget(self.tracks_of(free))
+        self.points.put(tracks, solution.points)
         self.triangulate(free)
 
-    def prune(self, photos: Iterable[int]) -> int:
-        """Drop the observations of photos that miss their point by more than `limit_px`, and lone points.
-
-        Returns how many were dropped.
-        """
-        dropped = 0
+    def prune(self, photos: Iterable[int]) -> None:
+        """Drop the observations of photos that miss their point by more than `limit_px`, and lone points."""
         for photo in photos:
-            features, tracks = self.seen_points(photo)
-            if not tracks:
-                continue
-            p = np.array([self.points[t] for t in tracks])
-            error = reprojection_error(self.camera(photo), self.poses[photo], p, self.uv[photo][features])
-            for k in np.flatnonzero(error > self.limit_px * self.scale_of[photo]).tolist():
-                self.tracks.drop(tracks[k], photo)
-                dropped += 1
-                if sum(i in self.poses for i in self.tracks.members(tracks[k])) < 2:
-                    del self.points[tracks[k]]
-        return dropped
+            _, tracks = self.seen_points(photo)
+            for track in tracks[self._residuals_px(photo) > self.limit_px * self.scale_of[photo]].tolist():
+                self.tracks.drop(track, photo)
+                if sum(i in self.poses for i in self.tracks.members(track)) < MIN_VIEWS:
+                    self.points.forget(np.array([track]))
 
     def _judge(self) -> float:
         """Residual, working px, beyond which an observation is an outlier: four robust sigmas, within the settings."""
@@ -258,10 +256,9 @@ class Reconstruction:
 
     def residuals_px(self) -> F64:
         """Reprojection errors (M,) of all observations of placed photos, px of the full image."""
-        errors = [np.zeros(0)]
-        for photo in sorted(self.poses):
-            features, tracks = self.seen_points(photo)
-            if tracks:
-                p = np.array([self.points[t] for t in tracks])
-                errors.append(reprojection_error(self.camera(photo), self.poses[photo], p, self.uv[photo][features]))
-        return np.concatenate(errors)
+        return np.concatenate([np.zeros(0), *(self._residuals_px(photo) for photo in sorted(self.poses))])
+
+    def _residuals_px(self, photo: int) -> F64:
+        features, tracks = self.seen_points(photo)
+        p, uv = self.points.at(tracks), self.uv[photo][features]
+        return reprojection_error(self.camera(photo), self.poses[photo], p, uv)

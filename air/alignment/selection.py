@@ -6,13 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common.arrays import I64
+
 if TYPE_CHECKING:
     from air.alignment.reconstruction import Reconstruction
 
 GRID = 8
 
 
-def select_tracks(reconstruction: Reconstruction, photos: list[int], per_photo: int) -> list[int]:
+def select_tracks(reconstruction: Reconstruction, photos: list[int], per_photo: int) -> I64:
     """Tracks with a point seen by at least two of the photos, about `per_photo` a photo, even over its area.
 
     A track is taken while a photo that sees it still has room in the grid cell where it appears; tracks seen by more
@@ -20,7 +22,7 @@ def select_tracks(reconstruction: Reconstruction, photos: list[int], per_photo: 
     """
     quota = max(1, per_photo // GRID**2)
     wanted = set(photos)
-    tracks = {t for i in photos for t in reconstruction.seen_points(i)[1]}
+    tracks = reconstruction.tracks_of(photos).tolist()
     members = {t: [(i, f) for i, f in reconstruction.tracks.members(t).items() if i in wanted] for t in tracks}
     cells = {i: _cells(reconstruction, i) for i in photos}
     filled = {i: np.zeros(GRID * GRID, int) for i in photos}
@@ -31,7 +33,7 @@ def select_tracks(reconstruction: Reconstruction, photos: list[int], per_photo: 
         chosen.append(t)
         for i, f in members[t]:
             filled[i][cells[i][f]] += 1
-    return chosen
+    return np.array(chosen, np.int64)
 
 
 def _cells(reconstruction: Reconstruction, photo: int) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.arrays import I32, I64
+from common.arrays import I64
 
 
 class Tracks:
@@ -14,7 +14,7 @@ class Tracks:
     """
 
     def __init__(self) -> None:
-        self._of: dict[int, I32] = {}
+        self._of: dict[int, I64] = {}
         self._members: list[dict[int, int]] = []
 
     def __len__(self) -> int:
@@ -22,9 +22,9 @@ class Tracks:
 
     def add_photo(self, photo: int, features: int) -> None:
         """Make room for the features of a photo."""
-        self._of[photo] = np.full(features, -1, np.int32)
+        self._of[photo] = np.full(features, -1, np.int64)
 
-    def of(self, photo: int) -> I32:
+    def of(self, photo: int) -> I64:
         """Track of every feature of a photo (N,), −1 where it has none."""
         return self._of[photo]
 
