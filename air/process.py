@@ -1,7 +1,8 @@
-"""Processing a flight in one go: source → alignment → final adjustment → map → files. No bus, no clock in the result."""
+"""A flight in one go: source → alignment → final adjustment → map → files. No bus, no clock in the result."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -26,7 +27,8 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
     """
     watch = Stopwatch()
     source = open_source(url)
-    alignment, mapper = Alignment("offline", config.alignment), Mapper(config.mapping)
+    alignment = Alignment("offline", config.alignment)
+    mapper = Mapper(replace(config.mapping, revisable=False))
     with watch.stage("alignment"):
         _align(source, alignment, mapper, config, quiet)
     with watch.stage("adjustment"):

@@ -205,8 +205,11 @@ def _add_camera_priors(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem
         graph.add(gtsam.PriorFactorCal3DS2(K(i), _to_gtsam(prior.guess), noise.Gaussian.Covariance(covariance)))
 
 
-def _position_sigma(graph: gtsam.NonlinearFactorGraph, result: gtsam.Values, problem: BundleProblem) -> F64:
-    marginals = gtsam.Marginals(graph, result)
+def _position_sigma(graph: gtsam.NonlinearFactorGraph, result: gtsam.Values, problem: BundleProblem) -> F64 | None:
+    try:
+        marginals = gtsam.Marginals(graph, result)
+    except RuntimeError:  # nearly singular: the poses stand, only how good they are remains unsaid
+        return None
     sigma = np.zeros((len(problem.poses), 3))
     for i, T in enumerate(problem.poses):
         # gtsam's pose covariance is in the camera frame, rotation first.

@@ -206,12 +206,13 @@ class Reconstruction:
         for i, k in row_of.items():
             uv[photo == k] = self.uv[i][feature[photo == k]]
         scale = float(np.median([self.scale_of[i] for i in photos]))
+        used = sorted({self.camera_of[i] for i in photos})
         try:
             solution = adjust(
                 BundleProblem(
-                    cameras=self.cameras,
-                    camera_priors=self.camera_priors,
-                    camera_of=[self.camera_of[i] for i in photos],
+                    cameras=[self.cameras[c] for c in used],
+                    camera_priors=[self.camera_priors[c] for c in used],
+                    camera_of=[used.index(self.camera_of[i]) for i in photos],
                     poses=[self.poses[i] for i in photos],
                     pose_priors=[self.priors[i] for i in photos],
                     fixed=np.array([False] * len(free) + [True] * len(fixed)),
@@ -227,10 +228,11 @@ class Reconstruction:
         except RuntimeError:
             # gtsam names an undetermined point or pose: keep what is there, the next photo adds what is missing.
             return
+        for c, camera in zip(used, solution.cameras, strict=True):
+            self.cameras[c] = camera
         self._accept(solution, free, photos, tracks)
 
     def _accept(self, solution: BundleSolution, free: list[int], photos: list[int], tracks: I64) -> None:
-        self.cameras = list(solution.cameras)
         for k, i in enumerate(photos[: len(free)]):
             self.poses[i] = solution.poses[k]
             if solution.sigma is not None:
