@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
 from common import log
 from common.config import load
 from common.errors import LuojiaError
+
+# Photos and pairs are worked on in threads of our own; threads of OpenBLAS within them only get in each other's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main(arguments: list[str] | None = None) -> int:

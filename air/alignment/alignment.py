@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -58,7 +59,7 @@ class _Entry:
 
 
 class Alignment:
-    """Incremental alignment of photos (core: no clock, no file, no thread).
+    """Incremental alignment of photos.
 
     `add` takes prepared photos in any order and returns the keyframes that are new or have moved; `finish` adjusts
     everything once more and returns what moved. Photos that fit nowhere wait, and are placed when others connect them.
@@ -164,9 +165,12 @@ class Alignment:
         return PosePrior(p_world, p_sigma, down, sigma)
 
     def _match(self, index: int) -> None:
-        entry, block = self._entries[index], self._block
-        for other in self._neighbours(index):
-            pairs = match(self._entries[other].features, entry.features, self.settings, block.scale_of[index])
+        block, mine = self._block, self._entries[index].features
+        others = self._neighbours(index)
+        features = [self._entries[other].features for other in others]
+        with ThreadPoolExecutor(self.settings.threads) as pool:
+            found = pool.map(lambda theirs: match(theirs, mine, self.settings, block.scale_of[index]), features)
+        for other, pairs in zip(others, found, strict=True):
             if len(pairs):
                 self._matches[other, index] = pairs
                 block.tracks.link(other, index, pairs)

@@ -11,24 +11,27 @@ from common.arrays import I64, Bool
 
 USAC_CONFIDENCE = 0.999
 USAC_ITERATIONS = 3000
+MIN_FOR_GEOMETRY = 8
+"""Matches that determine a fundamental matrix."""
 
 
 def match(a: Features, b: Features, settings: AlignmentSettings, scale: float) -> I64:
     """Verified matches (M, 2) as feature indices of a and b; empty when there are fewer than `settings.min_matches`.
 
-    The strongest features come first; all of them only where those give too few. `scale` is full-image px per
-    working px.
+    The strongest features come first; all of them only where those give some, but too few. `scale` is full-image px
+    per working px.
     """
-    found = _match(a.strongest(settings.quick_features), b.strongest(settings.quick_features), settings, scale)
-    return found if len(found) >= settings.enough_matches else _match(a, b, settings, scale)
+    found = _verified(a.strongest(settings.quick_features), b.strongest(settings.quick_features), settings, scale)
+    if settings.promising_matches <= len(found) < settings.enough_matches:
+        found = _verified(a, b, settings, scale)
+    return found if len(found) >= settings.min_matches else found[:0]
 
 
-def _match(a: Features, b: Features, settings: AlignmentSettings, scale: float) -> I64:
+def _verified(a: Features, b: Features, settings: AlignmentSettings, scale: float) -> I64:
     candidates = mutual_nearest(a, b, settings.ratio)
-    if len(candidates) < settings.min_matches:
-        return np.zeros((0, 2), np.int64)
-    inliers = candidates[_epipolar_inliers(a, b, candidates, settings.verify_px * scale)]
-    return inliers if len(inliers) >= settings.min_matches else np.zeros((0, 2), np.int64)
+    if len(candidates) < MIN_FOR_GEOMETRY:
+        return candidates[:0]
+    return candidates[_epipolar_inliers(a, b, candidates, settings.verify_px * scale)]
 
 
 def mutual_nearest(a: Features, b: Features, ratio: float) -> I64:

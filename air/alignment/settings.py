@@ -8,11 +8,13 @@ class AlignmentSettings:
     """Settings of features, matching, resection and adjustment; lengths in metres, image lengths in px.
 
     Pixel thresholds refer to an image whose longer side is `working_px`; larger photos are reduced to it for features.
+    `threads` pairs of photos are matched at once; the result does not depend on it.
     """
 
     working_px: int = 960
     features: int = 6000
     quick_features: int = 2500
+    promising_matches: int = 8
     enough_matches: int = 200
     neighbours: int = 8
     ratio: float = 0.85
@@ -30,3 +32,4 @@ class AlignmentSettings:
     nadir_sigma_deg: float = 15.0
     growth: float = 1.3
     moved: float = 0.03
+    threads: int = 2
