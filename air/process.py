@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from air.mapping.mapper import Mapper
 from air.preparation import prepared
 from air.report import Report, Stopwatch, counts, known_cells, peak_memory, problems_of
 from air.sources.source import Source, open_source
-from common.errors import SourceError
+from common.errors import ExportError, SourceError
 from common.export.products import write_products
 from common.messages import Datum, Keyframe, MapTile
 
@@ -23,10 +24,12 @@ CHUNK = 10
 def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Report:
     """Map of a source, written as standard files with a report into a folder.
 
-    Raises SourceError when the source cannot be opened or none of its photos could be placed, and ExportError.
+    Raises SourceError when the source cannot be opened or none of its photos could be placed, and ExportError when
+    the folder cannot be written to, before any work is done.
     """
     watch = Stopwatch()
     source = open_source(url)
+    _make_folder(out)
     alignment = Alignment("offline", config.alignment)
     mapper = Mapper(replace(config.mapping, revisable=False))
     with watch.stage("alignment"):
@@ -42,6 +45,16 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
     report = _report(source, alignment, tiles, config, watch)
     report.write(out / "report.json")
     return report
+
+
+def _make_folder(out: Path) -> None:
+    """Create the folder and prove that it takes files: work of minutes must not end on a full or foreign disk."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ExportError(f"{out}: cannot be written to ({error.strerror}): choose another folder") from error
 
 
 def _align(source: Source, alignment: Alignment, mapper: Mapper, config: AirConfig, quiet: bool) -> None:

@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from common.arrays import F64
+from common.export.surface import MIN_VIEWS
 from common.messages import Datum, Keyframe, MapDigest, MapTile, TileId, TileRequest
 from common.wire import decode
 
@@ -83,7 +84,7 @@ class HeldDatum:
 Held = HeldTile | HeldKeyframe | HeldDatum
 
 
-def hold_tile(vehicle: str, tile: MapTile, payload: bytes, min_views: int = 2) -> HeldTile:
+def hold_tile(vehicle: str, tile: MapTile, payload: bytes, min_views: int = MIN_VIEWS) -> HeldTile:
     """The record that is kept of a tile; a cell is confident with `min_views` views and no dispute."""
     known = np.isfinite(tile.height)
     confident = known & ~tile.disputed & (tile.views >= min_views)
@@ -106,7 +107,7 @@ def hold_tile(vehicle: str, tile: MapTile, payload: bytes, min_views: int = 2) -
 class Cloud:
     """Newest revision wins, for several vehicles and flights at once."""
 
-    def __init__(self, min_views: int = 2) -> None:
+    def __init__(self, min_views: int = MIN_VIEWS) -> None:
         self.min_views = min_views
         self.payload_bytes = 0
         self._datums: dict[FlightId, HeldDatum] = {}

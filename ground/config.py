@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from common.bus import BusConfig
 from common.config import Range
 from common.errors import ConfigError
+from common.export.surface import MIN_VIEWS
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class GroundConfig:
     """One ground station; `station` is its name on the bus, `min_views` how many photos must agree on a cell."""
 
     station: str = "ground"
-    min_views: Annotated[int, Range(1, 255)] = 2
+    min_views: Annotated[int, Range(1, 255)] = MIN_VIEWS
     bus: StationBus = field(default_factory=StationBus)
     store: StoreConfig = field(default_factory=StoreConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)

@@ -9,6 +9,7 @@ import numpy as np
 from common.arrays import F64
 from common.bus_memory import intersects
 from common.errors import WireError
+from common.export.surface import MIN_VIEWS
 from common.keys import parse_key, stream_key, tile_key
 from common.messages import Datum, Health, Keyframe, Level, MapDigest, MapTile, Pose, TileRequest
 from common.streams import DATUM, DIGEST, KEYFRAME, TILE, Stream
@@ -37,7 +38,7 @@ class Outcome:
 class Station:
     """The merged map of all vehicles, where they are, and how well everything arrives."""
 
-    def __init__(self, name: str, min_views: int = 2) -> None:
+    def __init__(self, name: str, min_views: int = MIN_VIEWS) -> None:
         self.name = name
         self.cloud = Cloud(min_views)
         self.tracks = Tracks()

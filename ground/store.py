@@ -114,8 +114,10 @@ def read_store(path: Path) -> tuple[Cloud, Tracks]:
     try:
         connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10.0)
         try:
-            _check_version(connection, path)
-            load(connection, cloud, tracks, path)
+            # A service that was started a moment ago has made the file but not yet its tables.
+            if not _is_blank(connection):
+                _check_version(connection, path)
+                load(connection, cloud, tracks, path)
         finally:
             connection.close()
     except sqlite3.Error as error:
@@ -160,13 +162,18 @@ def _open(path: Path) -> sqlite3.Connection:
     try:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
-        if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+        if _is_blank(connection):
             connection.executescript(_SCHEMA)
         _check_version(connection, path)
     except BaseException:
         connection.close()
         raise
     return connection
+
+
+def _is_blank(connection: sqlite3.Connection) -> bool:
+    tables: int = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    return tables == 0
 
 
 def _check_version(connection: sqlite3.Connection, path: Path) -> None:

@@ -1,6 +1,7 @@
 """A synthetic piece of ground with relief, houses and a known transformation."""
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from common.se3 import rotation_vector_to_matrix
 from ground.evaluation.similarity import Similarity
@@ -34,3 +35,25 @@ def degraded(points: np.ndarray, seed: int, noise: float = 0.03, outliers: float
     flung = rng.random(len(points)) < outliers
     noisy[flung, 2] += rng.uniform(-3.0, 8.0, np.count_nonzero(flung))
     return noisy
+
+
+def meadow(count: int, seed: int, trees: bool = True) -> np.ndarray:
+    """Points (N, 3) m of a site of 110 × 80 m that slopes gently, with clods, kerbs and some trees."""
+    rng = np.random.default_rng(seed)
+    east, north = rng.uniform(-55, 55, count), rng.uniform(-40, 40, count)
+    up = 0.05 * east - 0.02 * north + 1.2 * np.sin(north / 30 + 0.5) * np.cos(east / 38)
+    clods = np.random.default_rng(76).normal(0, 0.07, (120, 120))
+    up += map_coordinates(clods, [east + 60, north + 60], order=1) + 0.12 * (np.sin(east / 9) > 0.8)
+    if trees:
+        place = np.random.default_rng(77).uniform(-1, 1, (25, 2)) * [55, 40]
+        away = np.linalg.norm(np.column_stack([east, north])[:, None] - place, axis=2).min(axis=1)
+        up += np.where(away < 2.5, 6.0 - away**2 / 2 + rng.normal(0, 0.3, count), 0.0)
+    return np.column_stack([east, north, up])
+
+
+def bent(points: np.ndarray, amplitude: float = 0.3) -> np.ndarray:
+    """The points lifted and lowered by up to `amplitude` m: a bowl and a wave of 60 m, as a block of photos is bent."""
+    east, north = points[:, 0], points[:, 1]
+    bowl = ((east / 55) ** 2 + (north / 40) ** 2) - 0.8
+    bend = amplitude * (0.6 * bowl + 0.4 * np.sin(east / 10 + 1) * np.cos(north / 12))
+    return points + np.column_stack([0 * east, 0 * east, bend])

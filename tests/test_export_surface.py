@@ -30,7 +30,7 @@ def test_tiles_far_apart_keep_their_places() -> None:
 
 def test_cells_of_few_views_and_disputed_cells_are_left_out() -> None:
     doubtful = tile(0, 0)
-    doubtful.views[:4] = 1
+    doubtful.views[:4] = 2
     doubtful.disputed[:, :4] = True
     assert len(mosaic([doubtful]).points()[0]) == (N - 4) * (N - 4)
     assert len(mosaic([doubtful], keep_disputed=True).points()[0]) == (N - 4) * N

@@ -163,6 +163,14 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
             read()
 
 
+def test_a_store_that_is_being_created_is_empty(tmp_path: Path) -> None:
+    path = tmp_path / "ground.sqlite"
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA journal_mode = WAL")
+    assert read_store(path)[0].flights() == []
+    connection.close()
+
+
 def test_a_missing_store_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"nowhere\.sqlite"):
         read_store(tmp_path / "nowhere.sqlite")

@@ -63,20 +63,27 @@ class Mapper:
         """Drops the photo's working copy: it is matched with no further photos, its part of the map stays."""
         self._images.pop(index, None)
 
-    def update(self, flight: str, keyframes: Sequence[Keyframe], ground_height: float | None = None) -> list[MapTile]:
+    def update(
+        self,
+        flight: str,
+        keyframes: Sequence[Keyframe],
+        ground_height: float | None = None,
+        moves: int | None = None,
+    ) -> list[MapTile]:
         """The tiles that these keyframes change, each with a revision one higher than before.
 
         A keyframe never seen is matched with its best partners; one with a higher revision whose new pose or
         intrinsics move the surface is triangulated anew. Surfaces that moved beyond what one update does follow in
         the next: without keyframes it only does that, and returns nothing once nothing is left. `ground_height` m in
-        world says roughly where the ground is as long as the map does not know it.
+        world says roughly where the ground is as long as the map does not know it; `moves` replaces the setting
+        `moves_per_update`: with 0 what is new comes first, and what moved is left for later.
         """
         if ground_height is not None:
             self._ground.suppose(ground_height)
         newer = [k for k in keyframes if self._is_news(k)]
         fresh = [k.index for k in newer if k.index not in self._keyframes]
         self._keyframes.update((k.index, k) for k in newer)
-        touched = self._place(self._moved())
+        touched = self._place(self._moved(self._settings.moves_per_update if moves is None else moves))
         for start in range(0, len(fresh), BATCH):
             pairs = self._new_pairs(fresh[start : start + BATCH])
             touched |= self._place(self._matched(pairs))
@@ -95,8 +102,11 @@ class Mapper:
             return keyframe.index in self._images
         return keyframe.revision > known.revision
 
-    def _moved(self) -> dict[Photos, Contribution]:
-        """Contributions at their new poses and intrinsics, of the pairs whose surface these move most."""
+    def _moved(self, limit: int) -> dict[Photos, Contribution]:
+        """Contributions at their new poses and intrinsics, of the pairs whose surface these move most.
+
+        Where to look for the next photos follows every move at once.
+        """
         moved: list[tuple[float, Photos, Contribution]] = []
         for photos, old in self._contributions.items():
             left, right = (self._keyframes[p] for p in photos)
@@ -105,9 +115,10 @@ class Mapper:
             samples = triangulate(old.matches, left, right, MOVE_STEP)
             distance = largest_move(old.samples, samples)
             if distance > self._settings.move_tolerance:
+                self._ground.learn(photos, samples)
                 moved.append((distance, photos, Contribution(old.matches, left, right, samples)))
         moved.sort(key=lambda m: (-m[0], m[1]))
-        return {photos: new for _, photos, new in moved[: self._settings.moves_per_update]}
+        return {photos: new for _, photos, new in moved[:limit]}
 
     def _new_pairs(self, indices: Iterable[int]) -> list[Photos]:
         """Pairs of these keyframes with their best partners that were not matched yet, older photo first."""

@@ -1,1 +1,1 @@
-"""What leaves the aircraft, in which order and how fast."""
+"""What the aircraft sends to the ground, in which order and at which pace."""

@@ -14,20 +14,21 @@ from common.export.datum import write_datum
 from common.export.laz import write_points
 from common.export.mesh import write_mesh
 from common.export.ply import write_points_ply
+from common.export.preview import write_preview
 from common.export.raster import write_dsm, write_ortho
-from common.export.surface import Surface, mosaic
+from common.export.surface import MIN_VIEWS, Surface, mosaic
 from common.export.trajectory import newest_keyframes, write_geojson, write_tum
 from common.messages import Datum, Keyframe, MapTile
 
 Writer = Callable[[Path], None]
 
 TRAJECTORY_PRODUCTS = ("datum.json", "trajectory.tum", "trajectory.geojson")
-MAP_PRODUCTS = ("map.laz", "map.ply", "dsm.tif", "ortho.tif", "mesh.glb", "mesh.ply")
+MAP_PRODUCTS = ("map.laz", "map.ply", "dsm.tif", "ortho.tif", "mesh.glb", "mesh.ply", "preview.jpg")
 _WRITERS_AT_ONCE = 2
 
 
 def write_products(
-    folder: Path, datum: Datum, tiles: Iterable[MapTile], keyframes: Iterable[Keyframe], min_views: int = 2
+    folder: Path, datum: Datum, tiles: Iterable[MapTile], keyframes: Iterable[Keyframe], min_views: int = MIN_VIEWS
 ) -> dict[str, Path]:
     """Write what the flight gives and return the path of each product by name.
 
@@ -82,6 +83,7 @@ def _map_writers(datum: Datum, surface: Surface) -> dict[str, Writer]:
         "ortho.tif": lambda path: write_ortho(path, surface, datum),
         "mesh.glb": lambda path: write_mesh(path, surface, datum),
         "mesh.ply": lambda path: write_mesh(path, surface, datum),
+        "preview.jpg": lambda path: write_preview(path, surface),
     }
 
 

@@ -13,6 +13,8 @@ from common.errors import ExportError
 from common.messages import MapTile
 
 MAX_CELLS = 250_000_000
+MIN_VIEWS = 3
+"""Photos that must agree on a cell: a single pair gives two, and at edges and in trees a pair errs unchecked."""
 _BAND_ROWS = 1024
 
 
@@ -49,7 +51,7 @@ class Surface:
 
 def mosaic(
     tiles: Iterable[MapTile],
-    min_views: int = 2,
+    min_views: int = MIN_VIEWS,
     keep_disputed: bool = False,
     min_patch_cells: int = 4,
     patch_step: float = 1.0,

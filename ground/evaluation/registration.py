@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from common.arrays import F64, I64, Bool
 from common.errors import EvaluationError
 from common.se3 import rotation_vector_to_matrix
+from ground.evaluation.patches import normal_equations
 from ground.evaluation.similarity import Similarity
 
 _COARSE_POINTS = 6_000
@@ -29,7 +30,8 @@ def register(source: F64, target: F64, with_scale: bool) -> Similarity:
     """The transform that lays the source (N, 3) on the target (M, 3), m, rigid or with a scale.
 
     Meant for maps that are georeferenced already: it finds offsets of some 10 m, tilts of some degrees and scales
-    within some 5 %, with partial overlap and outliers. Deterministic.
+    within some 5 %, with partial overlap and outliers, on ground that is bent by some decimetres. The scale is sought
+    from the rigid solution on, by how well the clouds cover each other. Deterministic.
     Raises EvaluationError when the clouds have too little in common.
     Source: Chen and Medioni, Object modelling by registration of multiple range images (1992), with Tukey's
     biweight on the residuals.
@@ -41,7 +43,7 @@ def register(source: F64, target: F64, with_scale: bool) -> Similarity:
     few = thin(fine, _COARSE_POINTS)
     T = _best_of(_shifts(fine, planes.points), few, few_planes, _WIDE_GATES, with_scale=False)
     if with_scale:
-        T = _best_of(_scaled(T, few), few, few_planes, _COARSE_GATES, with_scale=True)
+        T = _best_of(_scaled(T, few), few, few_planes, _COARSE_GATES, with_scale=False)
     T = _refine(T, fine, planes, _FINE_GATES, with_scale, still=1e-4)
     return Similarity.translation(centre) @ T @ Similarity.translation(-centre)
 
@@ -141,7 +143,7 @@ def _refine(
 
 
 def _step(points: F64, planes: _TangentPlanes, gate: float, with_scale: bool) -> Similarity:
-    """One Gauss–Newton step of the weighted point-to-plane distance over the pairs within the gate."""
+    """One Gauss–Newton step of the weighted point-to-plane distance over the pairs within the gate, bends allowed."""
     paired, index = planes.pairs(points, gate)
     if len(index) < _MIN_PAIRS:
         raise EvaluationError(
@@ -160,9 +162,9 @@ def _step(points: F64, planes: _TangentPlanes, gate: float, with_scale: bool) ->
     if with_scale:
         columns.append(np.einsum("ni,ni->n", p - centre, n)[:, None])
     J = np.hstack(columns)
-    normal_matrix = (J * weight[:, None]).T @ J
+    normal_matrix, towards = normal_equations(J, residual, weight, p[:, :2])
     ridge = 1e-9 * np.trace(normal_matrix) * np.eye(len(normal_matrix))
-    delta = -np.linalg.solve(normal_matrix + ridge, J.T @ (weight * residual))
+    delta = np.linalg.solve(normal_matrix + ridge, towards)
     turn = Similarity(1.0 + delta[6] if with_scale else 1.0, rotation_vector_to_matrix(delta[:3]), delta[3:6])
     return Similarity.translation(centre) @ turn @ Similarity.translation(-centre)
 
