@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from air.alignment.alignment import Alignment, State
+from air.alignment.alignment import Alignment
 from air.alignment.prepare import PreparedPhoto
+from air.alignment.status import State
 from air.config import AirConfig
 from air.mapping.mapper import Mapper
 from air.report import counts, problems_of

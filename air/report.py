@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from air.alignment.alignment import PhotoStatus, State
+from air.alignment.status import PhotoStatus, State
 from air.sources.source import Problem
 from common.camera import CameraModel
 from common.messages import MapTile

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from air.alignment.alignment import Alignment, State
+from air.alignment.alignment import Alignment
 from air.alignment.prepare import prepare
 from air.alignment.settings import AlignmentSettings
+from air.alignment.status import State
 from air.sources.source import open_source
 from common.geo import T_world_other
 from ground.evaluation.similarity import umeyama

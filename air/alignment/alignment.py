@@ -2,50 +2,32 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
-import cv2
 import numpy as np
 
 from air.alignment.bundle import DOWN, PosePrior
 from air.alignment.geometry import PairPrior, relative_pose, triangulate_pair
 from air.alignment.georeference import georeference
 from air.alignment.matching import match
-from air.alignment.prepare import Features, PreparedPhoto
+from air.alignment.prepare import Features, PreparedPhoto, thumbnail
 from air.alignment.reconstruction import Reconstruction
 from air.alignment.settings import AlignmentSettings
-from common.arrays import F64, I64, U8
+from air.alignment.status import PhotoStatus, State
+from common.arrays import F64, I64
 from common.camera import CameraModel
 from common.geo import T_ecef_enu, geodetic_to_ecef
 from common.messages import Datum, GnssFix, Keyframe, Photo
 from common.se3 import SE3
 
-THUMBNAIL_PX = 320
 CALIBRATE_SPREAD = 0.15
 """Extent of the block across its strips from which the intrinsics are adjusted: one strip leaves them undetermined."""
 FINAL_ROUNDS, FINAL_OBSERVATIONS = 2, 60_000
 LOCAL_FREE = 6
 LOCAL_FIXED = 12
 MIN_PAIR_ANGLE_DEG = 2.0
-
-
-class State(StrEnum):
-    """What became of a photo."""
-
-    PLACED = "placed"
-    WAITING = "waiting"
-    REJECTED = "rejected"
-
-
-@dataclass(frozen=True)
-class PhotoStatus:
-    """What became of a photo, with the reason where it is not simply placed."""
-
-    name: str
-    state: State
-    reason: str
 
 
 @dataclass(eq=False)
@@ -106,8 +88,9 @@ class Alignment:
 
     @property
     def cameras(self) -> list[CameraModel]:
-        """The cameras as estimated now."""
-        return list(self._block.cameras)
+        """The cameras of the placed photos as estimated now, the one with most photos first."""
+        used = Counter(self._block.camera_of[i] for i in sorted(self._block.poses))
+        return [self._block.cameras[c] for c, _ in used.most_common()]
 
     def residual_px(self) -> float:
         """Root mean square of the reprojection errors, px of the full image."""
@@ -405,11 +388,3 @@ class Alignment:
         fix = fix or next(e.photo.fix for e in self._entries.values() if e.photo.fix is not None)
         sigma = np.array([fix.sigma_horizontal, fix.sigma_horizontal, fix.sigma_vertical])
         return np.asarray(sigma / np.sqrt(max(1, self.placed)))
-
-
-def thumbnail(image: U8) -> bytes:
-    """A small JPEG of an RGB image (H, W, 3)."""
-    scale = THUMBNAIL_PX / max(image.shape[:2])
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return bytes(jpeg.tobytes())

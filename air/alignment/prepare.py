@@ -16,6 +16,7 @@ from common.camera import CameraModel
 from common.messages import Photo
 
 MIN_FEATURES = 100
+THUMBNAIL_PX = 320
 ORDINARY_FOCAL = 0.8
 """Focal length per image width where a photo says nothing of its camera: a common wide lens."""
 
@@ -98,3 +99,11 @@ def detect(image: U8, settings: AlignmentSettings) -> Features:
     uv, descriptors = uv[first][: settings.features], descriptors[first][: settings.features]
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
     return Features(((uv + 0.5) / scale - 0.5).astype(np.float32), root.astype(np.float32))
+
+
+def thumbnail(image: U8) -> bytes:
+    """A small JPEG of an RGB image (H, W, 3)."""
+    scale = THUMBNAIL_PX / max(image.shape[:2])
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return bytes(jpeg.tobytes())
