@@ -45,6 +45,8 @@ def scene(lines: int = 3, per_line: int = 5, relief: float = 8.0, pixel_noise: f
         seen = np.flatnonzero(((uv > 0) & (uv < [1279, 959])).all(axis=1))
         rows += [(i, j, *(uv[j] + rng.normal(0, pixel_noise, 2))) for j in seen]
     table = np.array(rows)
+    often = np.bincount(table[:, 1].astype(int), minlength=n) >= 2
+    table = table[often[table[:, 1].astype(int)]]
     return Scene(poses, points, table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
 
 

@@ -63,7 +63,7 @@ def test_adjustment_survives_wrong_matches():
 def test_intrinsics_stay_unless_they_are_calibrated():
     s = scene(lines=1)
     problem = disturbed(s, [T.t for T in s.poses], calibrate=False, final=False, focal=1.0)
-    assert adjust(problem).cameras[0].fx == pytest.approx(problem.cameras[0].fx, abs=0.01)
+    assert adjust(problem).cameras == problem.cameras
 
 
 def freed(poses, seed=3):

@@ -25,7 +25,7 @@ noise = gtsam.noiseModel
 UNTIED = 1e-6
 """fx and fy are one focal length: their difference may not exceed about this, widths."""
 FIXED, UNKNOWN = 1e-7, 1e6
-POINT_SIGMA = 100.0
+POINT_SIGMA = 1000.0
 """Weak prior of a point, m: keeps the system regular when a step takes a point behind its cameras."""
 HUBER = 1.345
 LM_ITERATIONS, LM_TOLERANCE = 8, 1e-3
@@ -96,19 +96,26 @@ def adjust(problem: BundleProblem) -> BundleSolution:
     """The adjusted problem. Raises RuntimeError (of gtsam) when the system is singular."""
     graph, values = _observations(problem)
     _add_pose_priors(graph, problem)
-    _add_camera_priors(graph, problem)
+    if problem.calibrate:
+        _add_camera_priors(graph, problem)
     ordering = _points_first(problem)
     result, iterations = _levenberg_marquardt(graph, values, ordering)
     if problem.calibrate:
         result, more = _gauss_newton(graph, result, ordering)
         iterations += more
     return BundleSolution(
-        cameras=[_from_gtsam(result.atCal3DS2(K(i)), c) for i, c in enumerate(problem.cameras)],
+        cameras=_cameras(result, problem),
         poses=[_se3(result.atPose3(X(i))) for i in range(len(problem.poses))],
         points=np.array([result.atPoint3(L(j)) for j in range(len(problem.points))]).reshape(-1, 3),
         sigma=_position_sigma(graph, result, problem) if problem.final else None,
         iterations=iterations,
     )
+
+
+def _cameras(result: gtsam.Values, problem: BundleProblem) -> list[CameraModel]:
+    if not problem.calibrate:
+        return list(problem.cameras)
+    return [_from_gtsam(result.atCal3DS2(K(i)), camera) for i, camera in enumerate(problem.cameras)]
 
 
 def _levenberg_marquardt(
@@ -153,7 +160,7 @@ def _points_first(problem: BundleProblem) -> gtsam.Ordering:
         ordering.push_back(L(j))
     for i in range(len(problem.poses)):
         ordering.push_back(X(i))
-    for i in range(len(problem.cameras)):
+    for i in range(len(problem.cameras) if problem.calibrate else 0):
         ordering.push_back(K(i))
     return ordering
 
@@ -162,8 +169,10 @@ def _observations(problem: BundleProblem) -> tuple[gtsam.NonlinearFactorGraph, g
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for i, T in enumerate(problem.poses):
         values.insert(X(i), gtsam.Pose3(gtsam.Rot3(T.R), T.t))
-    for i, camera in enumerate(problem.cameras):
-        values.insert(K(i), _to_gtsam(camera))
+    known = [_to_gtsam(camera) for camera in problem.cameras]
+    if problem.calibrate:
+        for i, calibration in enumerate(known):
+            values.insert(K(i), calibration)
     anywhere = noise.Isotropic.Sigma(3, POINT_SIGMA)
     for j, p in enumerate(problem.points):
         values.insert(L(j), p)
@@ -175,7 +184,11 @@ def _observations(problem: BundleProblem) -> tuple[gtsam.NonlinearFactorGraph, g
     camera_of = problem.camera_of
     uv_widths = problem.uv / width[problem.photo][:, None]
     for i, j, uv in zip(problem.photo.tolist(), problem.point.tolist(), uv_widths, strict=True):
-        graph.add(gtsam.GeneralSFMFactor2Cal3DS2(uv, model[camera_of[i]], X(i), L(j), K(camera_of[i])))
+        c = camera_of[i]
+        if problem.calibrate:
+            graph.add(gtsam.GeneralSFMFactor2Cal3DS2(uv, model[c], X(i), L(j), K(c)))
+        else:
+            graph.add(gtsam.GenericProjectionFactorCal3DS2(uv, model[c], X(i), L(j), known[c], False, False))
     return graph, values
 
 
@@ -195,10 +208,7 @@ def _add_pose_priors(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem) 
 
 
 def _add_camera_priors(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem) -> None:
-    for i, (camera, prior) in enumerate(zip(problem.cameras, problem.camera_priors, strict=True)):
-        if not problem.calibrate:
-            graph.add(gtsam.PriorFactorCal3DS2(K(i), _to_gtsam(camera), noise.Isotropic.Sigma(9, FIXED)))
-            continue
+    for i, prior in enumerate(problem.camera_priors):
         f, c, k = prior.focal_sigma, prior.principal_sigma, prior.radial_sigma
         covariance = np.diag(np.array([f, f, FIXED, c, c, k, k, FIXED, FIXED]) ** 2)
         covariance[0, 1] = covariance[1, 0] = f**2 - UNTIED**2
