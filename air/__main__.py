@@ -15,6 +15,13 @@ from common.errors import LuojiaError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+def command() -> int:
+    """Entry of the installed command: `main`, undisturbed by what gtsam writes to standard output by itself."""
+    sys.stdout = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return main()
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Exit code: 0 done, 1 an error that one line on stderr explains, 2 wrong usage."""
     args = _parser().parse_args(arguments)
@@ -68,4 +75,4 @@ def _run(args: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())
