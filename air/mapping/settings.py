@@ -31,7 +31,7 @@ class MappingSettings:
     max_baseline_ratio: float = 0.70
     min_overlap: float = 0.30
     image_pixels: int = 2_200_000
-    match_pixels: int = 1_000_000
+    match_pixels: int = 700_000
     images_kept: int = 150
     move_tolerance: float = 0.03
     moves_per_update: int = 16
