@@ -86,10 +86,7 @@ class LiveSystem:
         """The same of the aircraft, asked directly: no ground may be up, for it would answer too."""
         bus = router_at(self.endpoint)
         try:
-            for _ in range(50):
-                if list(bus.query(all_of(DIGEST), timeout_s=1.0)):
-                    break
-                time.sleep(0.1)
+            wait_until(lambda: bool(list(bus.query(all_of(DIGEST), timeout_s=1.0))), 30.0)
             held: Held = {}
             for stream, message in ((TILE, MapTile), (KEYFRAME, Keyframe)):
                 for key, payload in bus.query(all_of(stream), timeout_s=10.0):

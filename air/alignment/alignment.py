@@ -24,7 +24,7 @@ from common.se3 import SE3
 
 CALIBRATE_SPREAD = 0.15
 """Extent of the block across its strips from which the intrinsics are adjusted: one strip leaves them undetermined."""
-FINAL_ROUNDS, FINAL_OBSERVATIONS = 2, 60_000
+FINAL_ROUNDS, FINAL_OBSERVATIONS = 1, 45_000
 LOCAL_FREE = 6
 LOCAL_FIXED = 12
 MIN_PAIR_ANGLE_DEG = 2.0

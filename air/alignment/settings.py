@@ -30,6 +30,6 @@ class AlignmentSettings:
     principal_sigma: float = 0.01
     radial_sigma: float = 0.1
     nadir_sigma_deg: float = 15.0
-    growth: float = 1.3
+    growth: float = 1.5
     moved: float = 0.03
     threads: int = 2
