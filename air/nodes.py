@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from air.config import AirConfig
 from air.live import LiveMap
 from air.preparation import prepared
-from air.sources.source import Source, open_source
+from air.sources.source import PhotoSource, open_photos
 from air.uplink.uplink import Uplink
 from common.bus import ZenohBus
 from common.clock import SystemClock
@@ -36,7 +36,7 @@ def fly(config: AirConfig, url: str | None = None) -> int:
     Raises SourceError, also when the source fails on the way, and BusError.
     """
     stop = threading.Event()
-    source = open_source(url or config.source, config.pace, sleep=_sleep_until(stop))
+    source = open_photos(url or config.source, config.pace, sleep=_sleep_until(stop))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     flight = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -58,7 +58,9 @@ def fly(config: AirConfig, url: str | None = None) -> int:
 class Mapping:
     """The thread that takes photo after photo and hands what follows from it to the uplink."""
 
-    def __init__(self, live: LiveMap, source: Source, config: AirConfig, uplink: Uplink, stop: threading.Event) -> None:
+    def __init__(
+        self, live: LiveMap, source: PhotoSource, config: AirConfig, uplink: Uplink, stop: threading.Event
+    ) -> None:
         self._live = live
         self._source = source
         self._config = config

@@ -13,7 +13,7 @@ from air.config import AirConfig
 from air.mapping.mapper import Mapper
 from air.preparation import prepared
 from air.report import Report, Stopwatch, counts, known_cells, peak_memory, problems_of
-from air.sources.source import Source, open_source
+from air.sources.source import PhotoSource, open_photos
 from common.errors import ExportError, SourceError
 from common.export.products import write_products
 from common.messages import Datum, Keyframe, MapTile
@@ -28,7 +28,7 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
     the folder cannot be written to, before any work is done.
     """
     watch = Stopwatch()
-    source = open_source(url)
+    source = open_photos(url)
     _make_folder(out)
     alignment = Alignment("offline", config.alignment)
     mapper = Mapper(replace(config.mapping, revisable=False))
@@ -57,7 +57,7 @@ def _make_folder(out: Path) -> None:
         raise ExportError(f"{out}: cannot be written to ({error.strerror}): choose another folder") from error
 
 
-def _align(source: Source, alignment: Alignment, mapper: Mapper, config: AirConfig, quiet: bool) -> None:
+def _align(source: PhotoSource, alignment: Alignment, mapper: Mapper, config: AirConfig, quiet: bool) -> None:
     photos = prepared(source, config.alignment)
     for index, photo in enumerate(tqdm(photos, "aligning", len(source), unit="photo", disable=quiet)):
         alignment.add(photo)
@@ -74,18 +74,20 @@ def _map(keyframes: list[Keyframe], mapper: Mapper, alignment: Alignment, quiet:
     return mapper.tiles()
 
 
-def _write(out: Path, source: Source, datum: Datum, tiles: list[MapTile], keyframes: list[Keyframe]) -> None:
+def _write(out: Path, source: PhotoSource, datum: Datum, tiles: list[MapTile], keyframes: list[Keyframe]) -> None:
     write_products(out, datum, tiles, keyframes)
     if source.truth is not None:
         source.truth.write(out / "truth")
 
 
-def _why(alignment: Alignment, source: Source) -> str:
+def _why(alignment: Alignment, source: PhotoSource) -> str:
     problems = problems_of(alignment.statuses(), source.problems)
     return "; ".join(f"{p['photo']}: {p['reason']}" for p in problems[:3]) + ("; …" if len(problems) > 3 else "")
 
 
-def _report(source: Source, alignment: Alignment, tiles: list[MapTile], config: AirConfig, watch: Stopwatch) -> Report:
+def _report(
+    source: PhotoSource, alignment: Alignment, tiles: list[MapTile], config: AirConfig, watch: Stopwatch
+) -> Report:
     cells = known_cells(tiles)
     return Report(
         source=source.url,

@@ -9,7 +9,7 @@ from air.alignment.alignment import Alignment
 from air.alignment.prepare import prepare
 from air.alignment.settings import AlignmentSettings
 from air.alignment.status import State
-from air.sources.source import open_source
+from air.sources.source import open_photos
 from common.geo import T_world_other
 from ground.evaluation.similarity import umeyama
 
@@ -18,7 +18,7 @@ SETTINGS = AlignmentSettings()
 
 @pytest.fixture(scope="module")
 def survey():
-    source = open_source("sim:survey?seed=4&photos=14")
+    source = open_photos("sim:survey?seed=4&photos=14")
     return source.truth, [prepare(photo, SETTINGS) for photo in source]
 
 
@@ -74,7 +74,7 @@ def test_two_halves_that_a_late_photo_connects_become_one_block(survey):
 
 def test_photos_without_position_and_of_another_place_are_named_and_spoil_nothing(survey):
     truth, photos = survey
-    elsewhere = prepare(next(iter(open_source("sim:survey?seed=9&photos=2"))), SETTINGS)
+    elsewhere = prepare(next(iter(open_photos("sim:survey?seed=9&photos=2"))), SETTINGS)
     elsewhere = replace(elsewhere, photo=replace(elsewhere.photo, name="elsewhere.jpg"))
     blind = replace(photos[5], photo=replace(photos[5].photo, fix=None))
     alignment, _ = aligned([elsewhere, *photos[:5], blind, *photos[6:], photos[3]])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image, TiffImagePlugin
 
 from air.sources.exif import GPS_EPOCH, R_enu_cam, read_facts
-from air.sources.source import Source, open_source
+from air.sources.source import PhotoSource, open_photos
 from common.geo import geodetic_to_enu
 from common.messages import Datum, Photo
 
@@ -67,8 +67,8 @@ def make_jpeg(
     return out.getvalue()
 
 
-def photos_of(folder: Path) -> tuple[Source, list[Photo]]:
-    source = open_source(f"photos:{folder}")
+def photos_of(folder: Path) -> tuple[PhotoSource, list[Photo]]:
+    source = open_photos(f"photos:{folder}")
     photos = list(source)
     assert len(photos) == len(source)
     stamps = [photo.t_ns for photo in photos]
@@ -206,7 +206,7 @@ def test_damaged_photos_are_passed_on_and_named(tmp_path: Path) -> None:
 def test_a_photo_that_vanishes_is_named(tmp_path: Path) -> None:
     for i in range(3):
         (tmp_path / f"{i}.jpg").write_bytes(make_jpeg(taken=START + timedelta(seconds=i)))
-    source = open_source(f"photos:{tmp_path}")
+    source = open_photos(f"photos:{tmp_path}")
     (tmp_path / "1.jpg").unlink()
     assert [photo.name for photo in source] == ["0.jpg", "2.jpg"]
     assert [problem.name for problem in source.problems] == ["1.jpg"]

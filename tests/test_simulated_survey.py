@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from air.sources.simulated.survey import Survey
-from air.sources.source import Source, open_source
+from air.sources.source import PhotoSource, open_photos
 from common.export.datum import read_datum
 from common.export.projection import UtmProjection
 from common.export.trajectory import read_tum
@@ -21,7 +21,7 @@ from common.se3 import SE3, rotation_angle
 
 
 def survey(query: str) -> Survey:
-    source = open_source(f"sim:survey?{query}")
+    source = open_photos(f"sim:survey?{query}")
     assert isinstance(source, Survey)
     return source
 
@@ -32,7 +32,7 @@ def small() -> tuple[Survey, list[Photo]]:
     return source, list(source)
 
 
-def digest(source: Source) -> str:
+def digest(source: PhotoSource) -> str:
     return hashlib.sha256(b"".join(photo.jpeg + repr((photo.fix, photo.t_ns)).encode() for photo in source)).hexdigest()
 
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from air.sources.pace import Paced
-from air.sources.source import open_source
+from air.sources.source import open_photos
 from common.errors import SourceError
 from common.messages import Photo
 
@@ -43,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
 )
 def test_a_source_that_cannot_be_opened_is_refused_in_one_clear_line(url: str, named: list[str], folder: Path) -> None:
     with pytest.raises(SourceError) as refused:
-        open_source(url.replace("{folder}", str(folder)))
+        open_photos(url.replace("{folder}", str(folder)))
     message = str(refused.value)
     assert "\n" not in message
     for word in named:
@@ -53,13 +53,13 @@ def test_a_source_that_cannot_be_opened_is_refused_in_one_clear_line(url: str, n
 def test_a_folder_without_photos_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no photo")
     with pytest.raises(SourceError, match=r"holds no \*\.jpg"):
-        open_source(f"photos:{tmp_path}")
+        open_photos(f"photos:{tmp_path}")
 
 
 @pytest.mark.parametrize("pace", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_impossible_pace_is_refused(folder: Path, pace: float) -> None:
     with pytest.raises(SourceError, match="pace"):
-        open_source(f"photos:{folder}", pace)
+        open_photos(f"photos:{folder}", pace)
 
 
 class Clock:
@@ -106,7 +106,7 @@ def test_a_slow_consumer_is_caught_up_with_and_not_delayed_further() -> None:
 
 
 def test_a_paced_source_passes_on_what_its_source_knows(folder: Path) -> None:
-    plain, paced = open_source(f"photos:{folder}"), open_source(f"photos:{folder}", 1.0)
+    plain, paced = open_photos(f"photos:{folder}"), open_photos(f"photos:{folder}", 1.0)
     assert (paced.url, len(paced), paced.truth, paced.problems) == (plain.url, 1, None, plain.problems)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from air.sources.source import Problem, Source, Truth
+from air.sources.source import PhotoSource, Problem, Truth
 from common.messages import Photo
 
 
@@ -16,7 +16,7 @@ class Paced:
     Instants are counted from the first photo, so neither a slow reader nor a slow consumer accumulates delay.
     """
 
-    source: Source
+    source: PhotoSource
     pace: float
     clock: Callable[[], float]
     sleep: Callable[[float], None]

@@ -6,15 +6,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from common.errors import SourceError
+from common.measurements import Measurement
 from common.messages import Photo
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something wrong with one photo that the source could work around: its file name and what was wrong."""
+    """Something wrong that the source could work around: where (a photo's file name, a device) and what."""
 
     name: str
     text: str
@@ -28,8 +29,12 @@ class Truth(Protocol):
         ...
 
 
+Sensed = Measurement | Photo
+"""What a source can give."""
+
+
 class Source(Protocol):
-    """Photos in time order. `truth` is None for real flights."""
+    """Measurements and photos in the order in which they came. `truth` is None for real flights."""
 
     @property
     def url(self) -> str:
@@ -43,34 +48,54 @@ class Source(Protocol):
 
     @property
     def problems(self) -> Sequence[Problem]:
-        """What was wrong with single photos, as far as known: complete once the iteration has ended."""
+        """What was wrong on the way, as far as known: complete once the iteration has ended."""
         ...
+
+    def __iter__(self) -> Iterator[Sensed]: ...
+
+
+@runtime_checkable
+class PhotoSource(Source, Protocol):
+    """A source of nothing but photos, which knows how many it has."""
 
     def __iter__(self) -> Iterator[Photo]: ...
 
     def __len__(self) -> int: ...
 
 
-def open_source(
+def open_source(url: str) -> Source:
+    """The source that a URL names, e.g. `photos:flights/monday`, `ubx:rover.ubx` or `monday.mcap`.
+
+    Raises SourceError, in one line, for an unknown scheme, something that cannot be read, or an option that is
+    unknown or impossible.
+    """
+    scheme, colon, rest = url.partition(":")
+    if not colon and url.endswith(".mcap"):
+        scheme, rest = "mcap", url
+    if scheme not in _OPENERS:
+        schemes = ", ".join(sorted(_OPENERS))
+        raise SourceError(f"source {url!r} has no known scheme; use one of {schemes}, for example photos:DIR")
+    return _OPENERS[scheme](url, rest)
+
+
+def open_photos(
     url: str,
     pace: float | None = None,
     *,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
-) -> Source:
-    """The source that a URL names, e.g. `photos:flights/monday` or `sim:survey?seed=1&photos=60`.
+) -> PhotoSource:
+    """The photos that a URL names, e.g. `photos:flights/monday` or `sim:survey?seed=1&photos=60`.
 
     `pace` None gives photos as fast as they can be read, 1.0 at the pace of their time stamps, 2.0 twice as fast.
-    `clock` (monotonic, s) and `sleep` (s) serve the pace. Raises SourceError, in one line, for an unknown scheme,
-    a folder without photos, or an option that is unknown or impossible.
+    `clock` (monotonic, s) and `sleep` (s) serve the pace. Raises SourceError, in one line, like `open_source`, and
+    for a source of something else than photos.
     """
-    scheme, colon, rest = url.partition(":")
-    if not colon or scheme not in _OPENERS:
-        schemes = ", ".join(sorted(_OPENERS))
-        raise SourceError(f"source {url!r} has no known scheme; use one of {schemes}, for example photos:DIR")
     if pace is not None and not 0.0 < pace < float("inf"):
         raise SourceError(f"source {url!r}: pace is {pace}, must be a positive number (1 = as flown)")
-    source = _OPENERS[scheme](url, rest)
+    source = open_source(url)
+    if not isinstance(source, PhotoSource):
+        raise SourceError(f"source {url!r} gives no photos; use photos:DIR or sim:survey")
     if pace is None:
         return source
     from air.sources.pace import Paced
@@ -91,4 +116,7 @@ def _open_simulated(url: str, rest: str) -> Source:
     return open_survey(url, rest)
 
 
-_OPENERS: dict[str, Callable[[str, str], Source]] = {"photos": _open_photos, "sim": _open_simulated}
+_OPENERS: dict[str, Callable[[str, str], Source]] = {
+    "photos": _open_photos,
+    "sim": _open_simulated,
+}

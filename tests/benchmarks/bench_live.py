@@ -28,7 +28,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from browser import Browser, chromium  # noqa: E402
 
-from air.sources.source import open_source  # noqa: E402
+from air.sources.source import open_photos  # noqa: E402
 from common.bus import BusConfig, ZenohBus  # noqa: E402
 from common.config import parse  # noqa: E402
 from common.keys import all_of  # noqa: E402
@@ -97,7 +97,7 @@ def aircraft(source: str, pace: float, endpoint: str, folder: Path) -> Iterator[
 
 
 def measure(source: str, every_s: float, screenshot: Path | None) -> list[Row]:
-    photos = [(photo.name, photo.t_ns) for photo in open_source(source)]
+    photos = [(photo.name, photo.t_ns) for photo in open_photos(source)]
     spacing_s = np.diff([t_ns for _, t_ns in photos]).mean() * 1e-9
     pace = float(spacing_s / every_s)
     published: list[MapTile] = []

@@ -12,7 +12,7 @@ import numpy as np
 
 from air.mapping.mapper import Mapper
 from air.mapping.settings import MappingSettings
-from air.sources.source import open_source
+from air.sources.source import open_photos
 from common.messages import Keyframe
 
 WALL_STEP, WALL_DISTANCE = 0.5, 0.5
@@ -93,7 +93,7 @@ def main():
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    source = open_source(options.url)
+    source = open_photos(options.url)
     frames, images = keyframes_of(source)
     settings = MappingSettings(method=options.method, threads=options.threads)
     for run in ("compile", "measured"):

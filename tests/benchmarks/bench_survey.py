@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from figures import Figure, print_table, process
 
-from air.sources.source import open_source
+from air.sources.source import open_photos
 from common.export.projection import UtmProjection
 from ground.evaluation.clouds import compare_clouds, read_cloud
 from ground.evaluation.similarity import umeyama
@@ -49,7 +49,7 @@ def measure(url, noise):
         cameras = {row.alignment: row for row in compare_trajectories(ours, truth).rows}
         cloud, surface = (read_cloud(path) for path in (out / "map.laz", out / "truth" / "surface.laz"))
         clouds = {row.alignment: row for row in compare_clouds(cloud, surface).rows}
-    survey = open_source(url).truth
+    survey = open_photos(url).truth
     spread = np.sqrt(((truth.positions - truth.positions.mean(axis=0)) ** 2).sum())
     return (
         report["photos"]["placed"],

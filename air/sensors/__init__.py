@@ -1,0 +1,1 @@
+"""Devices: their bytes → measurements, without I/O and without a clock."""
