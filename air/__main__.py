@@ -1,18 +1,21 @@
-"""The `luojia-air` command: process, run."""
+"""The `luojia-air` command: process, run, info."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from common import log
 from common.config import load
 from common.errors import LuojiaError
 
-# Photos and pairs are worked on in threads of our own; threads of OpenBLAS within them only get in each other's way.
+# Photos and pairs are worked on in threads of our own; threads of libraries within them only get in each other's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 
 def command() -> int:
@@ -49,6 +52,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--source", metavar="SOURCE", help="instead of the configuration's")
     run.set_defaults(run=_run)
 
+    info = commands.add_parser("info", help="tell what is in a source: streams, counts, rates, gaps, faults")
+    info.add_argument("source", metavar="SOURCE", help="e.g. ubx:F, euroc:DIR, gopro:F, ulog:F, bag:F or F.mcap")
+    info.add_argument("--json", action="store_true", help="for programs, instead of a table")
+    info.add_argument("--quiet", action="store_true", help="no progress bar")
+    info.set_defaults(run=_info)
+
     for command in (process, run):
         command.add_argument("--config", type=Path, metavar="FILE", help="TOML file; without it the defaults hold")
     return parser
@@ -72,6 +81,33 @@ def _run(args: argparse.Namespace) -> int:
 
     log.setup()
     return fly(load(args.config, AirConfig), args.source)
+
+
+def _info(args: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+    from tqdm import tqdm
+
+    from air.info import summarize, table
+    from air.sources.source import open_source
+
+    source = open_source(args.source)
+    # `disable=None` shows the bar on terminals only.
+    passing = tqdm(source, unit=" items", leave=False, disable=True if args.quiet else None)
+    summary = summarize(source, passing)
+    if args.json:
+        print(json.dumps(asdict(summary), ensure_ascii=False, indent=2))
+        return 0
+    heading, *rows = table(summary)
+    shown = Table(*heading, title=f"{summary.url}: {summary.duration_s:.1f} s", box=None, title_justify="left")
+    for column in shown.columns[1:]:
+        column.justify = "right"
+    for row in rows:
+        shown.add_row(*row)
+    Console().print(shown)
+    for problem in summary.problems:
+        print(f"{problem.name}: {problem.text}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -116,7 +117,18 @@ def _open_simulated(url: str, rest: str) -> Source:
     return open_survey(url, rest)
 
 
+def _importer(module: str, function: str) -> Callable[[str, str], Source]:
+    """An opener in a module that is loaded when it is first used, with the libraries that read its format."""
+
+    def open_lazily(url: str, rest: str) -> Source:
+        source: Source = getattr(import_module(f"air.sources.{module}"), function)(url, rest)
+        return source
+
+    return open_lazily
+
+
 _OPENERS: dict[str, Callable[[str, str], Source]] = {
     "photos": _open_photos,
     "sim": _open_simulated,
+    "euroc": _importer("euroc", "open_euroc"),
 }
