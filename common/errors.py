@@ -17,6 +17,10 @@ class SourceError(LuojiaError):
     """A source cannot be opened or read; the message names the URL and what is accepted."""
 
 
+class DeviceError(LuojiaError):
+    """A device cannot be opened or read; the message names its place and what to do."""
+
+
 class BusError(LuojiaError):
     """The bus cannot be opened or reached; the message names the endpoint."""
 
