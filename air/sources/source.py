@@ -131,4 +131,5 @@ _OPENERS: dict[str, Callable[[str, str], Source]] = {
     "photos": _open_photos,
     "sim": _open_simulated,
     "euroc": _importer("euroc", "open_euroc"),
+    "rinex": _importer("rinex", "open_rinex"),
 }

@@ -1,0 +1,1 @@
+"""GNSS basics: ephemerides, satellite orbits and clocks, atmosphere, single-point positions."""
