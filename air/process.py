@@ -69,9 +69,9 @@ def _map(keyframes: list[Keyframe], mapper: Mapper, alignment: Alignment, quiet:
     with tqdm(desc="mapping", total=len(keyframes), unit="photo", disable=quiet) as bar:
         for start in range(0, len(keyframes), CHUNK):
             chunk = keyframes[start : start + CHUNK]
-            mapper.update(alignment.flight, chunk, alignment.ground_height())
+            mapper.place(chunk, alignment.ground_height())
             bar.update(len(chunk))
-    return mapper.tiles()
+    return mapper.fuse(alignment.flight)
 
 
 def _write(out: Path, source: PhotoSource, datum: Datum, tiles: list[MapTile], keyframes: list[Keyframe]) -> None:

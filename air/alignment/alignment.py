@@ -297,12 +297,10 @@ class Alignment:
     def _adjust_around(self, photo: int) -> None:
         """Adjust a new photo and those that share most with it, held by the next ones."""
         block = self._block
-        shared: dict[int, int] = {}
-        for track in block.seen_points(photo)[1].tolist():
-            for i in block.tracks.members(track):
-                if i in block.poses and i != photo:
-                    shared[i] = shared.get(i, 0) + 1
-        order = sorted(shared, key=lambda i: -shared[i])
+        others = [i for i in sorted(block.poses) if i != photo]
+        seen = block.tracks.observations(block.seen_points(photo)[1], others)
+        sharing, shared = np.unique(seen.photo, return_counts=True)
+        order = sharing[np.argsort(-shared, kind="stable")].tolist()
         free = [photo, *order[:LOCAL_FREE]]
         fixed = order[LOCAL_FREE : LOCAL_FREE + LOCAL_FIXED]
         block.adjust(free, fixed, calibrate=False, per_photo=self.settings.observations_per_photo // 2, final=False)
@@ -363,6 +361,8 @@ class Alignment:
 
     def _shift(self, i: int, before: tuple[SE3, CameraModel], now: tuple[SE3, CameraModel]) -> float:
         """How far the ground under the middle and the corners of a photo has moved, m."""
+        if before[0] is now[0] and before[1] is now[1]:
+            return 0.0
         w, h = now[1].width - 1.0, now[1].height - 1.0
         uv = np.array([[w / 2, h / 2], [0, 0], [w, 0], [0, h], [w, h]])
         depth = self._block.depth(i)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 
 from air.alignment.prepare import Features
 from air.alignment.settings import AlignmentSettings
-from common.arrays import I64, Bool
+from common.arrays import F32, I64, Bool
 
 USAC_CONFIDENCE = 0.999
 USAC_ITERATIONS = 3000
@@ -38,15 +39,32 @@ def mutual_nearest(a: Features, b: Features, ratio: float) -> I64:
     """Pairs (M, 2) that are each other's nearest by descriptor and clearly nearer than the second (Lowe's ratio)."""
     if len(a.uv) < 2 or len(b.uv) < 2:
         return np.zeros((0, 2), np.int64)
-    similarity = a.descriptors @ b.descriptors.T
+    nearest, best, second, nearest_back = _nearest(a.descriptors @ b.descriptors.T)
     rows = np.arange(len(a.uv))
-    nearest = similarity.argmax(axis=1)
-    best = similarity[rows, nearest]
-    similarity[rows, nearest] = -1.0
-    distinct = np.flatnonzero((1.0 - best) < ratio**2 * (1.0 - similarity.max(axis=1)))
-    similarity[rows, nearest] = best
-    mutual = similarity[:, nearest[distinct]].argmax(axis=0) == distinct
-    return np.stack([distinct[mutual], nearest[distinct[mutual]]], axis=1)
+    good = np.flatnonzero((1.0 - best < ratio**2 * (1.0 - second)) & (nearest_back[nearest] == rows))
+    return np.stack([good, nearest[good]], axis=1)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _nearest(similarity: F32) -> tuple[I64, F32, F32, I64]:
+    """Of a matrix (N, M) in one pass: each row's best column, its value and the second best; each column's best row."""
+    n, m = similarity.shape
+    nearest, nearest_back = np.zeros(n, np.int64), np.zeros(m, np.int64)
+    best, second = np.empty(n, np.float32), np.empty(n, np.float32)
+    best_back = np.full(m, np.float32(-2.0), np.float32)
+    for i in range(n):
+        first = next_best = np.float32(-2.0)
+        for j in range(m):
+            value = similarity[i, j]
+            if value > next_best:
+                if value > first:
+                    next_best, first, nearest[i] = first, value, j
+                else:
+                    next_best = value
+            if value > best_back[j]:
+                best_back[j], nearest_back[j] = value, i
+        best[i], second[i] = first, next_best
+    return nearest, best, second, nearest_back
 
 
 def _epipolar_inliers(a: Features, b: Features, pairs: I64, threshold_px: float) -> Bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -13,7 +12,7 @@ from air.alignment.geometry import reprojection_error, resect, triangulate
 from air.alignment.points import Points
 from air.alignment.selection import select_tracks
 from air.alignment.settings import AlignmentSettings
-from air.alignment.tracks import Tracks
+from air.alignment.tracks import Observations, Tracks
 from common.arrays import F64, I64
 from common.camera import CameraModel
 from common.se3 import SE3
@@ -45,6 +44,7 @@ class Reconstruction:
     component: dict[int, int] = field(default_factory=dict)
     points: Points = field(default_factory=Points)
     limit_px: float = field(init=False)
+    _rays: dict[int, tuple[CameraModel, F64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.limit_px = self.settings.resection_px
@@ -105,7 +105,7 @@ class Reconstruction:
     def resect(self, photo: int) -> int | None:
         """Place a photo on the points it shares with a component; the component, or None if too few agree."""
         features, tracks = self.seen_points(photo)
-        owner = np.array([self._owner(t) for t in tracks.tolist()], np.int64)
+        owner = self._owners(tracks)
         components, supports = np.unique(owner, return_counts=True)
         for component in components[np.argsort(-supports, kind="stable")].tolist():
             mine = np.flatnonzero(owner == component)
@@ -120,9 +120,13 @@ class Reconstruction:
                 return int(component)
         return None
 
-    def _owner(self, track: int) -> int:
-        placed = [i for i in self.tracks.members(track) if i in self.component]
-        return self.component[placed[0]] if placed else -1
+    def _owners(self, tracks: I64) -> I64:
+        """The component (K,) of each track with a point: that of the first placed photo that sees it."""
+        owner = np.full(len(tracks), -1, np.int64)
+        seen = self.tracks.observations(tracks, sorted(self.component, reverse=True))
+        for i in np.unique(seen.photo)[::-1].tolist():
+            owner[seen.row[seen.photo == i]] = self.component[i]
+        return owner
 
     def triangulate(self, photos: Iterable[int]) -> None:
         """Give points to the tracks of placed photos that have none yet and are seen from far enough apart.
@@ -137,47 +141,50 @@ class Reconstruction:
 
     def _triangulate(self, tracks: I64) -> I64:
         """Set the points of tracks on which all observations agree; the tracks that lost one and may do now."""
-        photo, feature, point = self._observations(tracks)
-        if not len(photo):
+        seen = self._observations(tracks)
+        if not len(seen.photo):
             return np.zeros(0, np.int64)
-        centres = np.array([self.poses[i].t for i in photo.tolist()])
-        directions, errors = np.zeros((len(photo), 3)), np.full(len(photo), np.inf)
-        groups = [(i, np.flatnonzero(photo == i)) for i in np.unique(photo).tolist()]
+        centres, directions = np.zeros((len(seen.photo), 3)), np.zeros((len(seen.photo), 3))
+        errors = np.full(len(seen.photo), np.inf)
+        groups = [(i, np.flatnonzero(seen.photo == i)) for i in np.unique(seen.photo).tolist()]
         for i, rows in groups:
-            rays = self.camera(i).rays(self.uv[i][feature[rows]])
-            directions[rows] = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ self.poses[i].R.T
-        points, angle = triangulate(directions, centres, point, len(tracks))
+            centres[rows] = self.poses[i].t
+            directions[rows] = self._directions(i)[seen.feature[rows]] @ self.poses[i].R.T
+        points, angle = triangulate(directions, centres, seen.row, len(tracks))
         for i, rows in groups:
-            uv = self.uv[i][feature[rows]]
-            error = reprojection_error(self.camera(i), self.poses[i], points[point[rows]], uv)
+            uv = self.uv[i][seen.feature[rows]]
+            error = reprojection_error(self.camera(i), self.poses[i], points[seen.row[rows]], uv)
             errors[rows] = error / self.scale_of[i]
         worst = np.zeros(len(tracks))
-        np.maximum.at(worst, point, errors)
+        np.maximum.at(worst, seen.row, errors)
         good = (worst < self.limit_px) & (angle > np.radians(self.settings.min_angle_deg))
         self.points.put(tracks[good], points[good])
         again = set()
-        for row in np.flatnonzero((errors >= self.limit_px) & (errors == worst[point])).tolist():
-            track = int(tracks[point[row]])
+        for k in np.flatnonzero((errors >= self.limit_px) & (errors == worst[seen.row])).tolist():
+            track = int(tracks[seen.row[k]])
             if len(self.tracks.members(track)) > MIN_VIEWS:
-                self.tracks.drop(track, int(photo[row]))
+                self.tracks.drop(track, int(seen.photo[k]))
                 again.add(track)
         return np.array(sorted(again), np.int64)
 
-    def _observations(self, tracks: I64) -> tuple[I64, I64, I64]:
-        """Photo, feature and row of the track (M,) of all observations in the largest component that sees each."""
-        rows = []
-        component = self.component
-        for j, track in enumerate(tracks.tolist()):
-            placed = [(i, f, j) for i, f in self.tracks.members(track).items() if i in component]
-            owners = {component[i] for i, _, _ in placed}
-            if len(owners) > 1:
-                count = Counter(component[i] for i, _, _ in placed)
-                owner = max(owners, key=lambda c: (count[c], -c))
-                placed = [row for row in placed if component[row[0]] == owner]
-            if len(placed) >= MIN_VIEWS:
-                rows += placed
-        photo, feature, point = np.array(rows, np.int64).reshape(-1, 3).T
-        return photo, feature, point
+    def _observations(self, tracks: I64) -> Observations:
+        """What placed photos see of each track, of those in the component that sees most of it, at least two."""
+        seen = self.tracks.observations(tracks, sorted(self.poses))
+        component_of = np.zeros(1 + max(self.component, default=0), np.int64)
+        component_of[list(self.component)] = list(self.component.values())
+        component = component_of[seen.photo]
+        count = np.zeros((len(tracks), 1 + component_of.max()), np.int64)
+        np.add.at(count, (seen.row, component), 1)
+        owner = count.argmax(axis=1)
+        return seen.only((component == owner[seen.row]) & (count.max(axis=1)[seen.row] >= MIN_VIEWS))
+
+    def _directions(self, photo: int) -> F64:
+        """Unit rays (N, 3) of all features of a photo in its camera's frame, kept until the camera changes."""
+        camera, known = self.camera(photo), self._rays.get(photo)
+        if known is None or known[0] is not camera:
+            rays = camera.rays(self.uv[photo])
+            known = self._rays[photo] = camera, rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return known[1]
 
     def retrack(self, matches: dict[tuple[int, int], I64]) -> None:
         """Form all tracks and points again from the matches: poses are better now, so good matches come back."""
@@ -194,17 +201,11 @@ class Reconstruction:
         """Adjust the poses of `free` photos and the points that they see, held by `fixed` photos; drop outliers."""
         photos = [*free, *fixed]
         tracks = select_tracks(self, photos, per_photo)
-        row_of = {i: k for k, i in enumerate(photos)}
-        rows = [
-            (row_of[i], j, f)
-            for j, t in enumerate(tracks.tolist())
-            for i, f in self.tracks.members(t).items()
-            if i in row_of
-        ]
-        photo, point, feature = np.array(rows, np.int64).reshape(-1, 3).T
-        uv = np.zeros((len(rows), 2))
-        for i, k in row_of.items():
-            uv[photo == k] = self.uv[i][feature[photo == k]]
+        seen = self.tracks.observations(tracks, photos)
+        photo, uv = np.zeros(len(seen.photo), np.int64), np.zeros((len(seen.photo), 2))
+        for k, i in enumerate(photos):
+            rows = seen.photo == i
+            photo[rows], uv[rows] = k, self.uv[i][seen.feature[rows]]
         scale = float(np.median([self.scale_of[i] for i in photos]))
         used = sorted({self.camera_of[i] for i in photos})
         try:
@@ -218,7 +219,7 @@ class Reconstruction:
                     fixed=np.array([False] * len(free) + [True] * len(fixed)),
                     points=self.points.at(tracks),
                     photo=photo,
-                    point=point,
+                    point=seen.row,
                     uv=uv,
                     pixel_sigma=self.settings.pixel_sigma * scale,
                     calibrate=calibrate,

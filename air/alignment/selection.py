@@ -17,27 +17,26 @@ GRID = 8
 def select_tracks(reconstruction: Reconstruction, photos: list[int], per_photo: int) -> I64:
     """Tracks with a point seen by at least two of the photos, about `per_photo` a photo, even over its area.
 
-    A track is taken while a photo that sees it still has room in the grid cell where it appears; tracks seen by more
-    photos come first, because they tie the block together.
+    Every cell of a grid over every photo chooses a few of the tracks that appear in it, those seen by most photos
+    first, because they tie the block together.
     """
     quota = max(1, per_photo // GRID**2)
-    wanted = set(photos)
-    tracks = reconstruction.tracks_of(photos).tolist()
-    members = {t: [(i, f) for i, f in reconstruction.tracks.members(t).items() if i in wanted] for t in tracks}
-    cells = {i: _cells(reconstruction, i) for i in photos}
-    filled = {i: np.zeros(GRID * GRID, int) for i in photos}
-    chosen = []
-    for t in sorted(tracks, key=lambda t: (-len(members[t]), t)):
-        if len(members[t]) < 2 or all(filled[i][cells[i][f]] >= quota for i, f in members[t]):
-            continue
-        chosen.append(t)
-        for i, f in members[t]:
-            filled[i][cells[i][f]] += 1
-    return np.array(chosen, np.int64)
+    tracks = reconstruction.tracks_of(photos)
+    seen = reconstruction.tracks.observations(tracks, photos)
+    views = np.bincount(seen.row, minlength=len(tracks))
+    seen = seen.only(views[seen.row] >= 2)
+    place = np.zeros(len(seen.photo), np.int64)
+    for photo in photos:
+        rows = seen.photo == photo
+        place[rows] = photo * GRID**2 + _cells(reconstruction, photo)[seen.feature[rows]]
+    order = np.lexsort((seen.row, -views[seen.row], place))
+    _, first, count = np.unique(place[order], return_index=True, return_counts=True)
+    rank = np.arange(len(order)) - np.repeat(first, count)
+    return np.asarray(tracks[np.unique(seen.row[order][rank < quota])])
 
 
-def _cells(reconstruction: Reconstruction, photo: int) -> list[int]:
+def _cells(reconstruction: Reconstruction, photo: int) -> I64:
     camera = reconstruction.camera(photo)
     size = np.array([camera.width, camera.height])
-    xy = np.clip((reconstruction.uv[photo] * GRID / size).astype(int), 0, GRID - 1)
-    return (xy[:, 1] * GRID + xy[:, 0]).tolist()  # type: ignore[no-any-return]
+    xy = np.clip((reconstruction.uv[photo] * GRID / size).astype(np.int64), 0, GRID - 1)
+    return np.asarray(xy[:, 1] * GRID + xy[:, 0])

@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import numpy as np
 
 from common.arrays import I64
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Which feature of which photo belongs to which row of a list of tracks: arrays (M,), photo by photo."""
+
+    photo: I64
+    feature: I64
+    row: I64
+
+    def only(self, mask: np.typing.NDArray[np.bool_]) -> Observations:
+        """Those of a mask (M,)."""
+        return Observations(self.photo[mask], self.feature[mask], self.row[mask])
 
 
 class Tracks:
@@ -31,6 +47,17 @@ class Tracks:
     def members(self, track: int) -> dict[int, int]:
         """Feature of each photo in a track."""
         return self._members[track]
+
+    def observations(self, tracks: I64, photos: Iterable[int]) -> Observations:
+        """What the photos see of tracks (K,); `row` is the place of the track among these."""
+        row_of = np.full(len(self._members) + 1, -1, np.int64)  # the last one is for features without a track
+        row_of[tracks] = np.arange(len(tracks))
+        found = []
+        for photo in photos:
+            rows = row_of[self._of[photo]]
+            features = np.flatnonzero(rows >= 0)
+            found.append(np.stack([np.full(len(features), photo), features, rows[features]]))
+        return Observations(*np.hstack([np.zeros((3, 0), np.int64), *found]))
 
     def link(self, a: int, b: int, pairs: I64) -> None:
         """Join features of photos a and b that match, (M, 2)."""

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from air.mapping.layer import Layer
-from common.arrays import F16, F32, F64, I32, U8, Bool
+from common.arrays import F16, F32, F64, I32, I64, U8, Bool
 
 # Heights agree within this many standard deviations of their difference, and a quarter of a cell.
 AGREEMENT_SIGMAS = 3.0
@@ -91,7 +91,7 @@ def _fuse(heights: F32, sigmas: F32, radii: F32, photos: I32, floor: float) -> t
     disputed = np.zeros((rows, columns), np.bool_)
     source = np.full((rows, columns), -1, np.int32)
     z, sigma, weight = np.empty(count), np.empty(count), np.empty(count)
-    layer = np.empty(count, np.int64)
+    layer, order = np.empty(count, np.int64), np.empty(count, np.int64)
     agrees = np.empty(count, np.bool_)
     seen = np.full(photos.max() + 1 if count else 1, -1, np.int64)
     for row in range(rows):
@@ -104,7 +104,7 @@ def _fuse(heights: F32, sigmas: F32, radii: F32, photos: I32, floor: float) -> t
                     n += 1
             if n == 0:
                 continue
-            best = _consensus(z[:n], sigma[:n], weight[:n], floor)
+            best = _consensus(z[:n], sigma[:n], weight[:n], floor, order[:n])
             total, mean, inliers = 0.0, 0.0, 0
             for i in range(n):
                 limit = AGREEMENT_SIGMAS * np.sqrt(sigma[i] ** 2 + sigma[best] ** 2) + floor
@@ -137,9 +137,9 @@ def _fuse(heights: F32, sigmas: F32, radii: F32, photos: I32, floor: float) -> t
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _consensus(z: F64, sigma: F64, weight: F64, floor: float) -> int:
+def _consensus(z: F64, sigma: F64, weight: F64, floor: float, order: I64) -> int:
     """Index of the height that most of the weight agrees with; of two that are nearly equal in that, the upper one."""
-    order = np.argsort(z)
+    _sort(z, order)
     half, total = 0.0, weight.sum()
     middle = order[-1]
     for i in order:
@@ -156,6 +156,17 @@ def _consensus(z: F64, sigma: F64, weight: F64, floor: float) -> int:
         if support > UPPER_SUPPORT * best_support:
             best, best_support = i, max(support, best_support)
     return int(best)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sort(z: F64, order: I64) -> None:
+    """Fills `order` with the indices of ascending heights, by insertion: there are few, and nothing is allocated."""
+    for i in range(len(z)):
+        j = i
+        while j > 0 and z[order[j - 1]] > z[i]:
+            order[j] = order[j - 1]
+            j -= 1
+        order[j] = i
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -48,6 +48,7 @@ class Mapper:
         self._tried: set[Photos] = set()
         self._contributions: dict[Photos, Contribution] = {}
         self._ground = Ground()
+        self._touched: set[TileId] = set()
         self._tiles = Tiles(self._settings.cell, self._settings.tile_cells)
 
     def add_image(self, index: int, image: U8) -> None:
@@ -70,11 +71,18 @@ class Mapper:
         ground_height: float | None = None,
         moves: int | None = None,
     ) -> list[MapTile]:
-        """The tiles that these keyframes change, each with a revision one higher than before.
+        """The tiles that these keyframes change, each with a revision one higher than before: `place`, then `fuse`."""
+        self.place(keyframes, ground_height, moves)
+        return self.fuse(flight)
+
+    def place(
+        self, keyframes: Sequence[Keyframe], ground_height: float | None = None, moves: int | None = None
+    ) -> None:
+        """Puts what these keyframes show into the map, to be fused when somebody wants to see it.
 
         A keyframe never seen is matched with its best partners; one with a higher revision whose new pose or
-        intrinsics move the surface is triangulated anew. Surfaces that moved beyond what one update does follow in
-        the next: without keyframes it only does that, and returns nothing once nothing is left. `ground_height` m in
+        intrinsics move the surface is triangulated anew. Surfaces that moved beyond what one call does follow in
+        the next: without keyframes it only does that, and touches nothing once nothing is left. `ground_height` m in
         world says roughly where the ground is as long as the map does not know it; `moves` replaces the setting
         `moves_per_update`: with 0 what is new comes first, and what moved is left for later.
         """
@@ -83,12 +91,17 @@ class Mapper:
         newer = [k for k in keyframes if self._is_news(k)]
         fresh = [k.index for k in newer if k.index not in self._keyframes]
         self._keyframes.update((k.index, k) for k in newer)
-        touched = self._place(self._moved(self._settings.moves_per_update if moves is None else moves))
+        self._touched |= self._place(self._moved(self._settings.moves_per_update if moves is None else moves))
         for start in range(0, len(fresh), BATCH):
             pairs = self._new_pairs(fresh[start : start + BATCH])
-            touched |= self._place(self._matched(pairs))
+            self._touched |= self._place(self._matched(pairs))
+
+    def fuse(self, flight: str) -> list[MapTile]:
+        """The tiles touched since the last time, each with a revision one higher than before."""
         t_ns = max((k.t_ns for k in self._keyframes.values()), default=0)
-        return self._tiles.fuse(flight, t_ns, touched)
+        tiles = self._tiles.fuse(flight, t_ns, self._touched, self._settings.threads)
+        self._touched = set()
+        return tiles
 
     def tiles(self) -> list[MapTile]:
         """All tiles at their current revision."""

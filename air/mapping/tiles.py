@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 from air.mapping.fusion import fuse
 from air.mapping.layer import Layer
@@ -28,9 +29,10 @@ class Tiles:
             self._layers[tile][photos] = layer
         return touched | set(layers)
 
-    def fuse(self, flight: str, t_ns: int, touched: Iterable[TileId]) -> list[MapTile]:
+    def fuse(self, flight: str, t_ns: int, touched: Iterable[TileId], threads: int = 1) -> list[MapTile]:
         """The touched tiles fused anew, in order, each with a revision one higher than before."""
-        fused = [self._fuse(flight, t_ns, tile) for tile in sorted(touched)]
+        with ThreadPoolExecutor(threads) as pool:
+            fused = list(pool.map(lambda tile: self._fuse(flight, t_ns, tile), sorted(touched)))
         self._tiles.update((tile.id, tile) for tile in fused)
         return fused
 
