@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 # One thread for BLAS: air and ground run side by side, and small matrices gain nothing from more.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help install demo test test-slow lint bench clean
+.PHONY: help install demo test test-slow fuzz lint bench clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -22,6 +22,9 @@ test: install ## run the quick tests
 
 test-slow: install ## run the tests that take more than half a minute each
 	$(BIN)/pytest -m slow
+
+fuzz: install ## feed damaged bytes to every reader, SECONDS=600 each
+	$(BIN)/python tests/fuzzing.py --seconds $(or $(SECONDS),600)
 
 lint: install ## check style, types and the direction of imports
 	$(BIN)/ruff check .
