@@ -9,7 +9,8 @@ import re
 from dataclasses import dataclass
 
 from common.errors import WireError
-from common.messages import TileId
+from common.measurements import CameraFrame, ClockState, GlonassEphemeris, Ionosphere, KeplerEphemeris, RawBytes
+from common.messages import Health, Keyframe, MapTile, Message, TileId
 from common.streams import STREAMS, Stream
 
 PREFIX = "luojia/@v1"
@@ -33,6 +34,30 @@ def stream_key(vehicle: str, stream: Stream, *rest: str | int) -> str:
 def tile_key(vehicle: str, stream: Stream, tile: TileId) -> str:
     """Key of one map tile: level, x, y."""
     return stream_key(vehicle, stream, tile.level, tile.x, tile.y)
+
+
+def place_of(stream: Stream, message: Message) -> tuple[str, ...]:
+    """The chunks that a message adds to the name of its stream: a tile's place, a device, a satellite."""
+    if not stream.keyed:
+        return ()
+    match message:
+        case MapTile(id=TileId(level, x, y)):
+            return (str(level), str(x), str(y))
+        case Keyframe(index=index):
+            return (str(index),)
+        case Health(role=name) | CameraFrame(camera=name) | Ionosphere(system=name):
+            return (name,)
+        case RawBytes(device=name) | ClockState(device=name):
+            return (name,)
+        case KeplerEphemeris(satellite=name) | GlonassEphemeris(satellite=name):
+            return (name,)
+        case _:
+            raise TypeError(f"{type(message).__name__} has no place in a keyed stream")
+
+
+def message_key(vehicle: str, stream: Stream, message: Message) -> str:
+    """Key under which a message is published."""
+    return stream_key(vehicle, stream, *place_of(stream, message))
 
 
 def all_of(stream: Stream, vehicle: str = "*") -> str:

@@ -13,6 +13,7 @@ from enum import StrEnum
 
 from common.arrays import F32, F64, I32, U8, Bool
 from common.camera import CameraModel
+from common.measurements import Measurement
 from common.se3 import SE3
 
 
@@ -161,4 +162,4 @@ class Health:
     counts: dict[str, int] = field(default_factory=dict)
 
 
-Message = Datum | Pose | Keyframe | MapTile | MapDigest | TileRequest | Health
+Message = Datum | Pose | Keyframe | MapTile | MapDigest | TileRequest | Health | Measurement

@@ -18,6 +18,7 @@ Check = Callable[[Any, str], None]
 _TYPES: dict[str, Callable[[Any], bool]] = {
     "object": lambda value: isinstance(value, dict),
     "array": lambda value: isinstance(value, list),
+    "boolean": lambda value: type(value) is bool,
     "string": lambda value: isinstance(value, str),
     "integer": lambda value: type(value) is int,
     "number": lambda value: type(value) is int or (isinstance(value, float) and math.isfinite(value)),
@@ -100,6 +101,8 @@ def _range(schema: Schema, defs: dict[str, Schema]) -> Check:
     above = schema.get("exclusiveMinimum", -math.inf)
 
     def check(value: Any, at: str) -> None:
+        if value is None:
+            return
         if not low <= value <= high:
             raise MismatchError(f"{at} is {_show(value)}; allowed: {low} to {high}")
         if not value > above:
@@ -112,6 +115,8 @@ def _length(schema: Schema, defs: dict[str, Schema]) -> Check:
     low, high = schema.get("minLength", 0), schema.get("maxLength", math.inf)
 
     def check(value: Any, at: str) -> None:
+        if value is None:
+            return
         if not low <= len(value) <= high:
             raise MismatchError(f"{at} has {len(value)} characters; allowed: {low} to {high}")
 

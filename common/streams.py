@@ -5,6 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from common.measurements import (
+    CameraFrame,
+    ClockState,
+    GlonassEphemeris,
+    GnssEpoch,
+    ImuSample,
+    Ionosphere,
+    KeplerEphemeris,
+    RawBytes,
+    ReceiverSolution,
+    VehicleState,
+)
 from common.messages import Datum, Health, Keyframe, MapDigest, MapTile, Message, Pose, TileRequest
 
 
@@ -61,4 +73,30 @@ KEYFRAME = Stream("keyframe", Keyframe, 0.0, Priority.DATA, Congestion.BLOCK, Ra
 TILE = Stream("map/tile", MapTile, 0.0, Priority.DATA_LOW, Congestion.BLOCK, Radio.VIDEO, 256_000, 0.0, keyed=True)
 TILE_REQUEST = Stream("cmd/tiles", TileRequest, 0.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 64_000, 0.0)
 
-STREAMS: tuple[Stream, ...] = (POSE, DATUM, HEALTH, DIGEST, KEYFRAME, TILE, TILE_REQUEST)
+VEHICLE = Stream("vehicle", VehicleState, 10.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 3.0)
+CLOCK = Stream("clock", ClockState, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 1_000, 5.0, keyed=True)
+RTCM = Stream("rtcm", RawBytes, 1.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 16_000, 10.0)
+
+
+def _raw(
+    name: str, message: type[Message], rate_hz: float, max_bytes: int, stale_after_s: float, keyed: bool = False
+) -> Stream:
+    """What a device measured: on the local bus alone, and behind everything else."""
+    quality = (Priority.BACKGROUND, Congestion.DROP, Radio.LOCAL)
+    return Stream(name, message, rate_hz, *quality, max_bytes, stale_after_s, keyed)
+
+
+RAW_IMU = _raw("raw/imu", ImuSample, 200.0, 1_000, 0.5)
+RAW_GNSS = _raw("raw/gnss", GnssEpoch, 10.0, 128_000, 2.0)
+RAW_EPHEMERIS = _raw("raw/ephemeris", KeplerEphemeris, 0.0, 1_000, 0.0, keyed=True)
+RAW_GLONASS = _raw("raw/glonass", GlonassEphemeris, 0.0, 1_000, 0.0, keyed=True)
+RAW_IONOSPHERE = _raw("raw/ionosphere", Ionosphere, 0.0, 1_000, 0.0, keyed=True)
+RAW_SOLUTION = _raw("raw/solution", ReceiverSolution, 10.0, 1_000, 2.0)
+RAW_CAMERA = _raw("raw/camera", CameraFrame, 30.0, 8_000_000, 1.0, keyed=True)
+RAW_BYTES = _raw("raw/bytes", RawBytes, 0.0, 64_000, 0.0, keyed=True)
+
+STREAMS: tuple[Stream, ...] = (
+    *(POSE, DATUM, HEALTH, DIGEST, KEYFRAME, TILE, TILE_REQUEST),
+    *(VEHICLE, CLOCK, RTCM),
+    *(RAW_IMU, RAW_GNSS, RAW_EPHEMERIS, RAW_GLONASS, RAW_IONOSPHERE, RAW_SOLUTION, RAW_CAMERA, RAW_BYTES),
+)

@@ -12,7 +12,7 @@ from common.bus import Bus, Server, Subscription
 from common.errors import BusError, StoreError
 from common.keys import alive_key, all_of, stream_key
 from common.messages import TileRequest
-from common.streams import DATUM, DIGEST, HEALTH, KEYFRAME, STREAMS, TILE, TILE_REQUEST, Stream
+from common.streams import DATUM, DIGEST, HEALTH, KEYFRAME, RTCM, STREAMS, TILE, TILE_REQUEST, Radio, Stream
 from common.wire import encode
 from ground.mailbox import Letter, Mailbox
 from ground.station import GROUND_ROLE, Station
@@ -55,7 +55,7 @@ class Gateway:
         """Load what was kept, listen to everyone, and ask those who were there before. Raises BusError."""
         self._load()
         for stream in STREAMS:
-            if stream is not TILE_REQUEST:
+            if stream.radio is not Radio.LOCAL and stream not in (TILE_REQUEST, RTCM):
                 self._subscriptions.append(self._bus.subscribe(all_of(stream), self._hand_over))
         self._subscriptions.append(self._bus.watch_alive(alive_key("*", "*"), self._note_alive))
         self._subscriptions.append(self._bus.declare_alive(alive_key(self._station.name, GROUND_ROLE)))

@@ -6,8 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from common.errors import WireError
-from common.keys import Key, parse_key
-from common.messages import Health, Keyframe, MapTile, Message
+from common.keys import Key, parse_key, place_of
+from common.messages import Keyframe, Message
 from common.streams import Stream
 from common.wire import decode
 
@@ -136,14 +136,6 @@ class Inbox:
 
 def _check_place(key: Key, message: Message) -> None:
     """Raises WireError when the chunks behind the stream's name are not the place that the message gives."""
-    match message:
-        case MapTile():
-            place: tuple[object, ...] = (message.id.level, message.id.x, message.id.y)
-        case Keyframe():
-            place = (message.index,)
-        case Health():
-            place = (message.role,)
-        case _:
-            place = ()
-    if key.rest != tuple(map(str, place)):
+    place = place_of(key.stream, message)
+    if key.rest != place:
         raise WireError(f"{key.stream.name}: the key ends in {'/'.join(key.rest)!r}, the message says {place}")

@@ -59,8 +59,8 @@ def test_no_stream_hides_another() -> None:
 
 
 def test_nothing_is_larger_than_a_dropping_link_carries() -> None:
-    """Zenoh loses dropped messages over about 2 MB even on an idle link; a tile must be 256 kB at most."""
-    assert max(stream.max_bytes for stream in STREAMS) <= 256_000
+    """Zenoh loses dropped messages over about 2 MB even on an idle link; what goes by radio is 256 kB at most."""
+    assert max(stream.max_bytes for stream in STREAMS if stream.radio is not Radio.LOCAL) <= 256_000
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,22 @@ import numpy as np
 from hypothesis import strategies as st
 
 from common.camera import CameraModel
+from common.measurements import (
+    CameraFrame,
+    ClockPhase,
+    ClockState,
+    Encoding,
+    FixKind,
+    GlonassEphemeris,
+    GnssEpoch,
+    ImuSample,
+    Ionosphere,
+    KeplerEphemeris,
+    RawBytes,
+    ReceiverSolution,
+    Severity,
+    VehicleState,
+)
 from common.messages import (
     Datum,
     Health,
@@ -87,6 +104,107 @@ SAMPLES: tuple[Message, ...] = (
     MapDigest(FLIGHT, 1_400_000_002_000_000_000, np.array([[0, -1, 2, 5], [0, 0, 0, 1]], np.int32)),
     TileRequest(FLIGHT, np.array([[0, -1, 2], [3, 4, -5]], np.int32)),
     Health(1_400_000_003_000_000_000, "uplink", Level.DEGRADED, "video link lost – 12 tiles wait", {"tiles": 12}),
+    RawBytes(1_400_000_004_000_000_000, "gnss", bytes(range(16))),
+    ImuSample(
+        1_400_000_004_005_000_000,
+        np.array([0.125, -0.25, 9.8125]),
+        np.array([0.5, -0.0625, math.nan]),
+        None,
+        np.array([0.5, -0.5, 0.5, 0.5]),
+        31.5,
+        True,
+    ),
+    CameraFrame(1_400_000_004_010_000_000, "front", 3, 2, 2, Encoding.BGR8, bytes(range(12)), 0.002, None, 1.5e-5),
+    GnssEpoch(
+        1_400_000_004_100_000_000,
+        "gnss",
+        ("G05", "R12"),
+        ("1C", "1C"),
+        np.array([2.0e7, 2.125e7]),
+        np.array([1.05e8, math.nan]),
+        np.array([-1250.5, 310.25]),
+        np.array([45.0, 38.0]),
+        np.array([64.5, 0.0]),
+        np.array([False, True]),
+        np.array([0.32, 0.64]),
+        np.array([0.004, math.nan]),
+        np.array([0.064, 0.128]),
+        np.array([0, -4], np.int32),
+        18,
+    ),
+    KeplerEphemeris(
+        t_ns=1_400_000_004_200_000_000,
+        satellite="E31",
+        source="INAV",
+        toe_ns=1_399_999_800_000_000_000,
+        toc_ns=1_399_999_800_000_000_000,
+        iode=77,
+        iodc=77,
+        af0=-1.5e-4,
+        af1=2.5e-12,
+        af2=0.0,
+        sqrt_a=5440.609375,
+        e=0.00025,
+        i0=0.96875,
+        omega0=-1.25,
+        omega=0.5,
+        m0=2.75,
+        delta_n=2.5e-9,
+        idot=-1.25e-10,
+        omega_dot=-5.5e-9,
+        cuc=1.5e-6,
+        cus=9.5e-6,
+        crc=105.5,
+        crs=28.25,
+        cic=-2.5e-8,
+        cis=5e-8,
+        group_delay=(-4.5e-9, math.nan),
+        accuracy=3.125,
+        health=0,
+    ),
+    GlonassEphemeris(
+        1_400_000_004_300_000_000,
+        "R12",
+        1_399_999_500_000_000_000,
+        (1.1e7, -2.2e7, 5.5e6),
+        (-750.5, 1200.25, 3000.125),
+        (-1.0e-6, 2.0e-6, 0.0),
+        6.5e-5,
+        1.0e-12,
+        -4,
+        0,
+        0,
+    ),
+    Ionosphere(1_400_000_004_400_000_000, "G", (1.0e-8, 0.0, -6.0e-8, 0.0), (90112.0, 0.0, -196608.0, -65536.0)),
+    ReceiverSolution(
+        1_400_000_004_500_000_000,
+        "gnss",
+        FixKind.RTK_FLOAT,
+        30.5,
+        114.375,
+        62.25,
+        0.5,
+        0.75,
+        np.array([3.0, -0.125, math.nan]),
+        0.25,
+        math.nan,
+        21,
+    ),
+    ClockState(1_400_000_005_000_000_000, "imu", ClockPhase.LOCKED, -123_456_789_012, -18.5, 1.25e-4, 5000, 3, 1),
+    VehicleState(
+        1_400_000_005_100_000_000,
+        1,
+        armed=True,
+        q_enu_body=np.array([1.0, 0.0, 0.0, 0.0]),
+        height_home=40.5,
+        v_enu=np.array([3.0, 0.0, -0.125]),
+        fix=FixKind.FIX_3D,
+        satellites=14,
+        battery=0.75,
+        gimbal=(0.0, -1.5, math.nan),
+        severity=Severity.WARNING,
+        text="wind",
+    ),
 )
 TYPES = tuple(type(sample) for sample in SAMPLES)
 
@@ -125,6 +243,47 @@ _tile = st.builds(
     st.sampled_from([0.0, 5.0, 300.0, 4000.0]),
 )
 
+_name = st.text(st.characters(codec="utf-8"), min_size=1, max_size=20)
+_issue = st.integers(0, 65535)
+_satellite = st.builds("{}{:02d}".format, st.sampled_from("GREC"), st.integers(1, 63))
+_unknown_sigma = st.floats(0.0, 1e6) | st.just(math.nan)
+_quaternion = _se3.map(lambda T: T.wxyz)
+
+
+def _unknown(bound: float) -> st.SearchStrategy[float]:
+    return _floats(bound) | st.just(math.nan)
+
+
+def _known_or_not(n: int) -> st.SearchStrategy[Any]:
+    return st.tuples(*[_unknown(1e6)] * n).map(np.array)
+
+
+def _column(n: int) -> st.SearchStrategy[Any]:
+    """What a column of floats may hold: anything."""
+    return st.lists(st.floats(width=64), min_size=n, max_size=n).map(lambda values: np.array(values, np.float64))
+
+
+def _epoch(n: int) -> st.SearchStrategy[GnssEpoch]:
+    def names(name: st.SearchStrategy[str]) -> st.SearchStrategy[tuple[str, ...]]:
+        return st.lists(name, min_size=n, max_size=n).map(tuple)
+
+    flags = st.lists(st.booleans(), min_size=n, max_size=n).map(lambda values: np.array(values, np.bool_))
+    channels = st.lists(st.integers(-7, 13), min_size=n, max_size=n).map(lambda values: np.array(values, np.int32))
+    return st.builds(
+        GnssEpoch,
+        *(_t_ns, _name, names(_satellite), names(st.sampled_from(["1C", "7Q"]))),
+        *([_column(n)] * 5),
+        flags,
+        *([_column(n)] * 3),
+        *(channels, st.none() | st.integers(-30, 30), st.booleans()),
+    )
+
+
+def _frame(width: int, height: int, encoding: Encoding, t_ns: int) -> CameraFrame:
+    size = width * height * {Encoding.MONO8: 1, Encoding.BGR8: 3}.get(encoding, 2)
+    return CameraFrame(t_ns, "front", t_ns, width, height, encoding, bytes(i % 251 for i in range(size)), 0.01, 1.5)
+
+
 STRATEGIES: dict[type[Any], st.SearchStrategy[Any]] = {
     Datum: st.builds(Datum, _flight, _floats(90.0), _floats(180.0), _floats(1e4)),
     Pose: st.builds(
@@ -152,6 +311,55 @@ STRATEGIES: dict[type[Any], st.SearchStrategy[Any]] = {
         st.sampled_from(Level),
         _text,
         st.dictionaries(_text, st.integers(-(2**63), 2**63 - 1), max_size=5),
+    ),
+    RawBytes: st.builds(RawBytes, _t_ns, _name, st.binary(max_size=50)),
+    ImuSample: st.builds(
+        ImuSample,
+        _t_ns,
+        _known_or_not(3),
+        _known_or_not(3),
+        st.none() | _known_or_not(3),
+        st.none() | _quaternion,
+        st.none() | _floats(100.0),
+        st.booleans(),
+    ),
+    CameraFrame: st.builds(_frame, st.integers(1, 20), st.integers(1, 20), st.sampled_from(Encoding), _t_ns),
+    GnssEpoch: st.integers(0, 60).flatmap(_epoch),
+    KeplerEphemeris: st.builds(
+        KeplerEphemeris,
+        *(_t_ns, _satellite, st.sampled_from(["LNAV", "INAV", "D2"]), _t_ns, _t_ns, _issue, _issue),
+        *([_floats(1.0)] * 3),
+        *(st.floats(0.0, 1e4), st.floats(0.0, 1.0)),
+        *([_floats(1e3)] * 13),
+        st.tuples(_unknown(1.0), _unknown(1.0)),
+        _unknown(1e4),
+        _count,
+    ),
+    GlonassEphemeris: st.builds(
+        GlonassEphemeris,
+        *(_t_ns, _satellite, _t_ns),
+        *([st.tuples(*[_floats(1e8)] * 3)] * 3),
+        *(_floats(1.0), _floats(1.0), st.integers(-7, 13), _issue, _count),
+    ),
+    Ionosphere: st.builds(Ionosphere, _t_ns, st.sampled_from("GCJ"), *([st.tuples(*[_floats(1e6)] * 4)] * 2)),
+    ReceiverSolution: st.builds(
+        ReceiverSolution,
+        *(_t_ns, _name, st.sampled_from(FixKind), _unknown(90.0), _unknown(180.0), _unknown(1e4)),
+        *(_unknown_sigma, _unknown_sigma, _known_or_not(3), _unknown_sigma, _unknown_sigma, _issue),
+    ),
+    ClockState: st.builds(
+        ClockState,
+        *(_t_ns, _name, st.sampled_from(ClockPhase), st.integers(-(2**63), 2**63 - 1)),
+        *(_unknown(1e3), _unknown_sigma, _t_ns, _t_ns, _t_ns),
+    ),
+    VehicleState: st.builds(
+        VehicleState,
+        *(_t_ns, st.integers(0, 255), st.none() | st.booleans(), st.none() | _text, st.none() | _quaternion),
+        *(st.none() | _floats(bound) for bound in (90.0, 180.0, 1e4, 1e4)),
+        *(st.none() | _known_or_not(3), st.none() | st.sampled_from(FixKind), st.none() | _issue),
+        *(st.none() | st.floats(0.0, 1.0) for _ in range(5)),
+        *(st.none() | st.tuples(*[_unknown(10.0)] * 3), st.none() | st.tuples(*[_unknown(10.0)] * 3)),
+        *(st.none() | st.floats(0.0, 1.0), st.none() | st.sampled_from(Severity), st.none() | _text),
     ),
 }
 
