@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Protocol
 
+from common.counts import Counts as Counts
 from common.measurements import Measurement
 
 
@@ -19,20 +18,6 @@ class TimeScale(Enum):
     """The device's own counter, unwrapped, in ns from any start."""
     ARRIVAL = auto()
     """The arrival of the bytes at the host: the protocol has no time stamps."""
-
-
-@dataclass
-class Counts:
-    """What a driver has seen so far: bytes, whole frames by kind, and what it had to drop.
-
-    A burst is an unbroken run of dropped bytes; `refused` counts frames that arrived whole but made no sense.
-    """
-
-    received_bytes: int = 0
-    dropped_bytes: int = 0
-    bursts: int = 0
-    refused: int = 0
-    frames: Counter[str] = field(default_factory=Counter)
 
 
 class Driver(Protocol):

@@ -42,8 +42,8 @@ _ERRORS = {3: "period", 4: "message", 30: "timer overflow", 32: "baud rate", 33:
 class XsensImu:
     """The driver of an MTi: feeds on the bytes of its port, whatever they are.
 
-    At 200 Hz it sends 17 kB/s: plenty for USB, on a serial line it takes 230400 baud or more. Gaps of the packet
-    counter add up in `missing`, what is wrong with the device stands in `faults`.
+    At 200 Hz it sends 17 kB/s, for which a serial line takes 230400 baud or more. What is wrong with the device
+    stands in `faults`.
     """
 
     def __init__(self, device: str = "imu") -> None:
@@ -56,7 +56,6 @@ class XsensImu:
         self._error: str | None = None
         self._self_test: bool | None = None
         self._temperature_c: float | None = None
-        self.missing = 0
 
     @property
     def device(self) -> str:
@@ -132,7 +131,7 @@ class XsensImu:
             counter = int(packets[DataId.PACKET_COUNTER][0])
             if self._counter is not None:
                 gap = (counter - self._counter - 1) % 0x10000
-                self.missing += gap if gap < 0x8000 else 0  # a step back is a device that started anew
+                self._counts.missing += gap if gap < 0x8000 else 0  # a step back is a device that started anew
             self._counter = counter
 
     def _sample(self, packets: Packets) -> ImuSample | None:

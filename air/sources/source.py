@@ -127,9 +127,19 @@ def _importer(module: str, function: str) -> Callable[[str, str], Source]:
     return open_lazily
 
 
+def _open_xbus(url: str, rest: str) -> Source:
+    from air.sensors.imu_xsens import XsensImu
+    from air.sources.device_file import DeviceFile
+
+    return DeviceFile(url, rest, XsensImu)
+
+
 _OPENERS: dict[str, Callable[[str, str], Source]] = {
     "photos": _open_photos,
     "sim": _open_simulated,
+    "xbus": _open_xbus,
+    "mavlink": _importer("mavlink_file", "open_mavlink"),
     "euroc": _importer("euroc", "open_euroc"),
+    "gopro": _importer("gopro", "open_gopro"),
     "rinex": _importer("rinex", "open_rinex"),
 }
