@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import parse_qsl
 
+from air.gnss.calendar import leap_seconds
 from air.sources.source import Problem, Sensed, Truth
 from common.errors import SourceError
+
+GEOID_SIGMA = 30.0
+"""m. Many logs know only heights above mean sea level. They stand in for ellipsoidal ones, and this is how far off
+they are: the geoid's undulation, 30 m in the mean square over the earth (EGM96)."""
 
 
 class Faults:
@@ -100,6 +106,14 @@ def find_folder(url: str, rest: str) -> Path:
 def in_time_order(*streams: Iterable[Sensed]) -> Iterator[Sensed]:
     """Streams that are each in time order, merged into one; only one item of each is held."""
     return heapq.merge(*streams, key=lambda item: item.t_ns)
+
+
+def gpst_of_unix(unix_ns: int) -> int:
+    """GPST, ns, of Unix time (UTC), ns; times before or after all calendars are taken as they are."""
+    try:
+        return unix_ns + leap_seconds(datetime.fromtimestamp(unix_ns // 1_000_000_000, UTC)) * 1_000_000_000
+    except (ValueError, OverflowError, OSError):
+        return unix_ns
 
 
 def one_line(error: BaseException) -> str:
