@@ -16,6 +16,7 @@ from air.live import LiveMap
 from air.preparation import prepared
 from air.sources.source import PhotoSource, open_photos
 from air.uplink.uplink import Uplink
+from air.warm_up import warm_up
 from common.bus import ZenohBus
 from common.clock import SystemClock
 from common.messages import Keyframe, Photo
@@ -41,6 +42,7 @@ def fly(config: AirConfig, url: str | None = None) -> int:
         signal.signal(number, lambda *_: stop.set())
     flight = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     log.info("flight %s of %s: %d photos from %s", flight, config.vehicle, len(source), source.url)
+    warm_up()
     bus = ZenohBus(config.bus)
     uplink = Uplink(bus, config.vehicle, flight, config.uplink, SystemClock().now_ns)
     mapping = Mapping(LiveMap(flight, config), source, config, uplink, stop)
