@@ -145,10 +145,8 @@ def _make_format(kind: type[Any]) -> Format:
     name = re.sub(r"(?<=.)(?=[A-Z])", "_", kind.__name__).lower()
     schema = schemas.load(name, VERSION)
     max_bytes = max(stream.max_bytes for stream in STREAMS if stream.message is kind)
-    if kind is MapTile:
-        pack, unpack = partial(pack_tile, max_bytes=max_bytes), unpack_tile
-    else:
-        pack, unpack = record_codec(kind, schema)
+    tile = (partial(pack_tile, max_bytes=max_bytes), unpack_tile)
+    pack, unpack = tile if kind is MapTile else record_codec(kind, schema)
     return Format(name, compile_schema(schema), pack, unpack, _CONTENT.get(kind, _accept), max_bytes)
 
 
