@@ -21,7 +21,7 @@ def warm_up() -> bool:
     rng = np.random.default_rng(0)
     width, height = SIZE
     ground = cv2.GaussianBlur(rng.integers(0, 255, (height, width + SHIFT, 3), np.uint8), (0, 0), 1.5)
-    camera = CameraModel(width, height, width, width, width / 2, height / 2)
+    camera = CameraModel(width, height, float(width), float(width), width / 2, height / 2)
     mapper = Mapper(MappingSettings())
     keyframes = []
     for index in range(2):
