@@ -144,7 +144,7 @@ def _fit(
         v = (ranges.pseudorange - model.expected - bias)[used]
         sigma = model.sigma[used]
         try:
-            cofactor: F64 = np.linalg.inv(H.T @ (H / sigma[:, None] ** 2))
+            cofactor = _cofactor(H, sigma)
             step = cofactor @ (H.T @ (v / sigma**2))
         except np.linalg.LinAlgError:
             return "ranges do not determine a position"
@@ -259,6 +259,11 @@ def _belongs(clocks: tuple[str, ...], used: Bool, name: str) -> F64:
     return np.array([clock == name for clock, use in zip(clocks, used, strict=True) if use], float)
 
 
+def _cofactor(H: F64, sigma: F64) -> F64:
+    """Covariance of the unknowns. Raises LinAlgError where the rows do not determine them."""
+    return np.asarray(np.linalg.inv(H.T @ (H / sigma[:, None] ** 2)), np.float64)
+
+
 def _worst(v: F64, sigma: F64, H: F64, cofactor: F64) -> int | None:
     """Index of the residual whose removal lowers χ² most (w-test), None where none can be checked by others."""
     left = sigma**2 - np.einsum("ij,jk,ik->i", H, cofactor, H)
@@ -293,7 +298,7 @@ def _fit_velocity(ranges: Ranges, fit: _Fit, settings: PositioningSettings) -> _
     while (redundancy := int(used.sum()) - 4) >= settings.min_redundancy + excluded:
         H, y, sigma = H_all[used], (ranges.range_rate - still)[used], sigma_all[used]
         try:
-            cofactor: F64 = np.linalg.inv(H.T @ (H / sigma[:, None] ** 2))
+            cofactor = _cofactor(H, sigma)
         except np.linalg.LinAlgError:
             break
         x = cofactor @ (H.T @ (y / sigma**2))

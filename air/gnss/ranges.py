@@ -20,7 +20,7 @@ CLOCKS = {"G": "G", "J": "G", "E": "E", "R": "R", "C": "C"}
 NEAREST, FURTHEST = 1.0e7, 1.0e8
 """Pseudoranges in m beyond these were not measured, whatever the receiver's clock shows."""
 
-_URA_BOUNDS = np.array([2.4, 3.4, 4.85, 6.85, 9.65, 13.65, 24, 48, 96, 192, 384, 768, 1536, 3072, 6144])
+_URA_BOUNDS = (2.4, 3.4, 4.85, 6.85, 9.65, 13.65, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, 1536.0, 3072.0, 6144.0)
 _GLONASS_ACCURACY = 5.0
 
 
@@ -30,7 +30,8 @@ class Ranges:
 
     `pseudorange` (N,) m with group delays removed; `range_rate` (N,) m/s from Doppler, NaN where there is none, of
     a signal of `frequency` (N,) Hz, with `sigma_rate` (N,) m/s as the receiver says, or NaN; `sigma` (N,) m, one
-    sigma of the satellite's orbit and clock; `clock` names the clock of each. `rejected` tells of the other satellites of the epoch why they are not here.
+    sigma of the satellite's orbit and clock; `clock` names the clock of each. `rejected` tells of the other
+    satellites of the epoch why they are not here.
     """
 
     satellites: tuple[str, ...]
@@ -65,7 +66,7 @@ def clean_ranges(epoch: GnssEpoch, broadcast: Ephemerides, settings: Positioning
             rows.append((satellite, ephemeris, pseudorange, row))
 
     ephemerides = [row[1] for row in rows]
-    pseudorange, index = np.array([row[2] for row in rows], float), np.array([row[3] for row in rows], int)
+    index = np.array([row[3] for row in rows], int)
     states = states_at_transmission(ephemerides, epoch.t_ns, epoch.pseudorange[index])
     f = np.array([frequency(epoch.satellites[i], epoch.signals[i], epoch.channel[i]) for i in index], float)
     kept = np.isfinite(states.position).all(axis=1) & np.isfinite(states.clock) & np.isfinite(f)
@@ -75,7 +76,7 @@ def clean_ranges(epoch: GnssEpoch, broadcast: Ephemerides, settings: Positioning
         satellites=satellites,
         clock=tuple(CLOCKS[satellite[0]] for satellite in satellites),
         states=SatelliteStates(states.position[kept], states.velocity[kept], states.clock[kept], states.drift[kept]),
-        pseudorange=pseudorange[kept],
+        pseudorange=np.array([row[2] for row in rows], float)[kept],
         range_rate=-epoch.doppler[index][kept] * LIGHT / f[kept],
         sigma_rate=epoch.sigma_doppler[index][kept] * LIGHT / f[kept],
         frequency=f[kept],
@@ -148,4 +149,4 @@ def _ephemeris_sigma(ephemeris: Ephemeris) -> float:
         return _GLONASS_ACCURACY
     if ephemeris.satellite[0] == "E":
         return ephemeris.accuracy if 0 <= ephemeris.accuracy <= 6 else 500.0
-    return float(_URA_BOUNDS[min(np.searchsorted(_URA_BOUNDS, ephemeris.accuracy), len(_URA_BOUNDS) - 1)])
+    return next((bound for bound in _URA_BOUNDS if ephemeris.accuracy <= bound), _URA_BOUNDS[-1])

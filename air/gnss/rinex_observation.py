@@ -205,7 +205,7 @@ def _epoch(
                 names.append(satellite)
                 signals.append(signal)
                 values.append(observed)
-                flags.append(int(fields[1][14:15]) if fields[1][14:15].isdecimal() else 0)
+                flags.append(int(fields[1][14]) if observed[1] == observed[1] and fields[1][14:15].isdecimal() else 0)
     table = np.array(values, float).reshape(-1, 4)
     loss = np.array(flags, np.int64).astype(np.uint8)
     n = len(names)
