@@ -49,7 +49,7 @@ class Outcome:
     growth_bytes: int
 
 
-class Stalled(Exception):
+class StalledError(Exception):
     """A reader took longer than it may."""
 
 
@@ -160,10 +160,10 @@ def _run(reader: Reader, data: bytes, measured: bool) -> tuple[float, int]:
 
 @contextmanager
 def _limited(cpu_s: float) -> Iterator[None]:
-    """Raises Stalled in a body that takes more CPU time; other timers of the process are left alone."""
+    """Raises StalledError in a body that takes more CPU time; other timers of the process are left alone."""
 
     def stop(number: int, frame: FrameType | None) -> None:
-        raise Stalled(f"took more than {cpu_s:g} s")
+        raise StalledError(f"took more than {cpu_s:g} s")
 
     before = signal.signal(signal.SIGVTALRM, stop)
     signal.setitimer(signal.ITIMER_VIRTUAL, cpu_s)

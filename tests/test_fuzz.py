@@ -40,7 +40,7 @@ def test_a_reader_that_stalls_is_stopped() -> None:
         while True:
             pass
 
-    with pytest.raises(AssertionError, match=r"endless: case 0 of seed 0: Stalled"):
+    with pytest.raises(AssertionError, match=r"endless: case 0 of seed 0: StalledError"):
         fuzz(Reader("endless", read, lambda: [b"abcd"]), seconds=5.0)
 
 

@@ -40,17 +40,17 @@ class Field:
 
 def unsigned(name: str, scale: float, *spans: tuple[int, int, int]) -> Field:
     """A field that is never negative."""
-    return Field(name, Sign.NONE, scale, spans)
+    return Field(name, Sign.NONE, float(scale), spans)
 
 
 def signed(name: str, scale: float, *spans: tuple[int, int, int]) -> Field:
     """A field in two's complement."""
-    return Field(name, Sign.TWOS_COMPLEMENT, scale, spans)
+    return Field(name, Sign.TWOS_COMPLEMENT, float(scale), spans)
 
 
 def magnitude(name: str, scale: float, *spans: tuple[int, int, int]) -> Field:
     """A field whose first bit is the sign of the rest, as GLONASS writes them."""
-    return Field(name, Sign.MAGNITUDE, scale, spans)
+    return Field(name, Sign.MAGNITUDE, float(scale), spans)
 
 
 @dataclass(frozen=True)

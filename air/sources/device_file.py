@@ -69,7 +69,7 @@ class DeviceFile:
                 f"{counts.dropped_bytes} of {counts.received_bytes} bytes in {counts.bursts} bursts are no frames"
             )
         if counts.refused:
-            self._note(f"{counts.refused} frames arrived whole but make no sense")
+            self._note(f"{counts.refused} frames arrived whole but made no sense, or had no time yet")
 
     def _note(self, text: str) -> None:
         self._problems.append(Problem(self._path.name, text))

@@ -127,19 +127,35 @@ def _importer(module: str, function: str) -> Callable[[str, str], Source]:
     return open_lazily
 
 
-def _open_xbus(url: str, rest: str) -> Source:
-    from air.sensors.imu_xsens import XsensImu
-    from air.sources.device_file import DeviceFile
+def _device(module: str, driver: str) -> Callable[[str, str], Source]:
+    """An opener of files of the bytes that a device sent, played through its driver."""
 
-    return DeviceFile(url, rest, XsensImu)
+    def open_lazily(url: str, rest: str) -> Source:
+        from air.sources.device_file import DeviceFile
+
+        return DeviceFile(url, rest, getattr(import_module(f"air.sensors.{module}"), driver))
+
+    return open_lazily
+
+
+def _open_recording(url: str, rest: str) -> Source:
+    from air.sources.recorded import RecordedSource
+
+    return RecordedSource(url, rest)
 
 
 _OPENERS: dict[str, Callable[[str, str], Source]] = {
+    "mcap": _open_recording,
     "photos": _open_photos,
     "sim": _open_simulated,
-    "xbus": _open_xbus,
+    "ubx": _device("gnss_ublox", "UbloxReceiver"),
+    "xbus": _device("imu_xsens", "XsensImu"),
     "mavlink": _importer("mavlink_file", "open_mavlink"),
+    "bag": _importer("bag", "open_bag"),
     "euroc": _importer("euroc", "open_euroc"),
     "gopro": _importer("gopro", "open_gopro"),
     "rinex": _importer("rinex", "open_rinex"),
+    "comma2k19": _importer("comma2k19", "open_comma2k19"),
+    "live": _importer("live", "open_live"),
+    "video": _importer("video", "open_video"),
 }
