@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from air.sensors.calibration import Calibration, read_calibration
 from air.sources.imported import Faults, Imported, find_folder, in_time_order
 from air.sources.source import Sensed
-from common.errors import SourceError
+from common.errors import LuojiaError, SourceError
 from common.measurements import CameraFrame, Encoding, ImuSample
 
 LONGEST_LINE = 4096
@@ -34,13 +35,25 @@ def open_euroc(url: str, rest: str) -> Imported:
     cameras = sorted(path.parent for path in root.glob("cam*/data.csv") if path.is_file())
     if not imu and not cameras:
         raise SourceError(f"source {url!r}: {str(root)!r} holds neither imu0/data.csv nor cam0/data.csv")
+    calibrations, no_calibration = _calibrations(cameras)
 
     def read(faults: Faults) -> Iterator[Sensed]:
-        return in_time_order(
-            *(_imu_samples(path, faults) for path in imu), *(_frames(path, faults) for path in cameras)
-        )
+        for camera, why in no_calibration.items():
+            faults.add(camera, why)
+        return in_time_order(*(_imu_samples(p, faults) for p in imu), *(_frames(p, faults) for p in cameras))
 
-    return Imported(url, read)
+    return Imported(url, read, calibrations)
+
+
+def _calibrations(cameras: list[Path]) -> tuple[dict[str, Calibration], dict[str, str]]:
+    """The calibrations of the cameras by name, and for the others why there is none."""
+    known, unknown = {}, {}
+    for path in cameras:
+        try:
+            known[path.name] = read_calibration(path / "sensor.yaml")
+        except LuojiaError as error:
+            unknown[path.name] = str(error)
+    return known, unknown
 
 
 def _imu_samples(path: Path, faults: Faults) -> Iterator[ImuSample]:
@@ -77,12 +90,16 @@ def png_size(png: bytes) -> tuple[int, int]:
 
 def _rows(path: Path, columns: int, faults: Faults) -> Iterator[tuple[int, list[str]]]:
     """Stamp and the other fields of each row of a table; rows that are not whole are counted and left out."""
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        for line in iter(partial(file.readline, LONGEST_LINE), ""):
-            if line.startswith("#") or not line.strip():
-                continue
-            fields = line.rstrip("\r\n").split(",")
-            if len(fields) == columns and fields[0].strip().isdecimal() and len(fields[0]) < 20:
-                yield int(fields[0]), fields[1:]
-            else:
-                faults.add(f"{path.parent.name}/{path.name}", "a row is not whole; left out", repr(line[:40]))
+    name = f"{path.parent.name}/{path.name}"
+    try:
+        with path.open(encoding="utf-8", errors="replace", newline="") as file:
+            for line in iter(partial(file.readline, LONGEST_LINE), ""):
+                if line.startswith("#") or not line.strip():
+                    continue
+                fields = line.rstrip("\r\n").split(",")
+                if len(fields) == columns and fields[0].strip().isdecimal() and len(fields[0]) < 20:
+                    yield int(fields[0]), fields[1:]
+                else:
+                    faults.add(name, "a row is not whole; left out", repr(line[:40]))
+    except OSError as error:
+        faults.add(name, f"cannot be read to its end: {error.strerror}")

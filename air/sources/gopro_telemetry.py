@@ -65,9 +65,8 @@ def sample_times(series: list[tuple[Payload, Series]]) -> F64:
     if len(series) < 3 or not np.all(np.diff(totals) > 0) or not np.all(np.diff(ends_s) > 0):
         spread = [p.start_s + p.duration_s * np.arange(n) / n for (p, _), n in zip(series, counts, strict=True) if n]
         return np.concatenate([np.zeros(0), *spread])
-    # Medians, because the first and the last payload are not full but last as long as the others.
-    period_s = np.median(np.diff(ends_s) / np.diff(totals))
-    start_s = np.median(ends_s - period_s * totals)
+    full = np.array(counts) > 0.9 * np.median(counts)  # the last payload is not, but lasts as long as the others
+    period_s, start_s = np.polyfit(totals[full], ends_s[full], 1)
     indices = [total + np.arange(-n, 0) for total, n in zip(totals, counts, strict=True)]
     return np.asarray(start_s + period_s * np.concatenate(indices))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl
 
 from air.gnss.calendar import leap_seconds
+from air.sensors.calibration import Calibration
 from air.sources.source import Problem, Sensed, Truth
 from common.errors import SourceError
 
@@ -44,9 +45,13 @@ Reader = Callable[[Faults], Iterator[Sensed]]
 
 
 class Imported:
-    """A source that is read by one function, anew at every iteration."""
+    """A source that is read by one function, anew at every iteration.
 
-    def __init__(self, url: str, read: Reader):
+    `calibrations` are those of its cameras by name, as far as they come with it.
+    """
+
+    def __init__(self, url: str, read: Reader, calibrations: Mapping[str, Calibration] | None = None):
+        self.calibrations = calibrations or {}
         self._url = url
         self._read = read
         self._faults = Faults()
@@ -106,6 +111,19 @@ def find_folder(url: str, rest: str) -> Path:
 def in_time_order(*streams: Iterable[Sensed]) -> Iterator[Sensed]:
     """Streams that are each in time order, merged into one; only one item of each is held."""
     return heapq.merge(*streams, key=lambda item: item.t_ns)
+
+
+def reordered(stream: Iterable[Sensed], horizon_ns: int = 1_000_000_000, most: int = 10_000) -> Iterator[Sensed]:
+    """A stream that is nearly in time order, in time order, as far as items are late by less than the horizon."""
+    held: list[tuple[int, int, Sensed]] = []
+    newest_ns = 0
+    for number, item in enumerate(stream):
+        heapq.heappush(held, (item.t_ns, number, item))
+        newest_ns = max(newest_ns, item.t_ns)
+        while held and (held[0][0] <= newest_ns - horizon_ns or len(held) > most):
+            yield heapq.heappop(held)[2]
+    while held:
+        yield heapq.heappop(held)[2]
 
 
 def gpst_of_unix(unix_ns: int) -> int:

@@ -138,14 +138,7 @@ def _device(module: str, driver: str) -> Callable[[str, str], Source]:
     return open_lazily
 
 
-def _open_recording(url: str, rest: str) -> Source:
-    from air.sources.recorded import RecordedSource
-
-    return RecordedSource(url, rest)
-
-
 _OPENERS: dict[str, Callable[[str, str], Source]] = {
-    "mcap": _open_recording,
     "photos": _open_photos,
     "sim": _open_simulated,
     "ubx": _device("gnss_ublox", "UbloxReceiver"),
@@ -155,6 +148,7 @@ _OPENERS: dict[str, Callable[[str, str], Source]] = {
     "euroc": _importer("euroc", "open_euroc"),
     "gopro": _importer("gopro", "open_gopro"),
     "rinex": _importer("rinex", "open_rinex"),
+    "mcap": _importer("recorded", "RecordedSource"),
     "comma2k19": _importer("comma2k19", "open_comma2k19"),
     "live": _importer("live", "open_live"),
     "video": _importer("video", "open_video"),
