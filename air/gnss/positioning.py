@@ -149,7 +149,7 @@ def _fit(
         except np.linalg.LinAlgError:
             return "ranges do not determine a position"
         position = position + step[:3]
-        clocks = {name: clocks.get(name, 0.0) + d for name, d in zip(groups, step[3:], strict=True)}
+        clocks = {name: clocks.get(name, 0.0) + d for name, d in zip(groups, step[3:].tolist(), strict=True)}
         length = float(np.linalg.norm(step))
         if not length < 1e9:
             return "the solution diverges"

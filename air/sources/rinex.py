@@ -34,25 +34,25 @@ def open_rinex(url: str, rest: str) -> Imported:
     paths = [Path(name).expanduser() for name in rest.split(",") if name]
     if not paths:
         raise SourceError(f"source {url!r} names no file; use rinex:OBS,NAV")
-    kinds = {path: _kind(url, path) for path in paths}
+    kinds = {path: kind_of(url, path) for path in paths}
 
     def read(faults: Faults) -> Iterator[Sensed]:
         channels: dict[str, int] = {}
         for path in (path for path in paths if kinds[path] == "N"):
-            with _lines(path, faults) as lines:
+            with lines_of(path, faults) as lines:
                 for message in read_navigation(lines):
                     if isinstance(message, GlonassEphemeris):
                         channels[message.satellite] = message.channel
                     yield message
         for path in (path for path in paths if kinds[path] == "O"):
-            with _lines(path, faults) as lines:
+            with lines_of(path, faults) as lines:
                 yield from read_observations(lines, channels, RECEIVER)
 
     return Imported(url, read)
 
 
 @contextmanager
-def _lines(path: Path, faults: Faults) -> Iterator[Lines]:
+def lines_of(path: Path, faults: Faults) -> Iterator[Lines]:
     """Lines of a file while it is open; what was damaged is noted when it is closed."""
     with _open(path) as file:
         lines = Lines(_decoded(file, path.name, faults))
@@ -77,10 +77,13 @@ def _decoded(file: BinaryIO, name: str, faults: Faults) -> Iterator[str]:
         faults.add(name, f"ends within its compression ({error})")
 
 
-def _kind(url: str, path: Path) -> str:
-    """O or N: what the header of a file says that it is."""
+def kind_of(url: str, path: Path) -> str:
+    """O (observation) or N (navigation): what the header of a file says that it is.
+
+    Raises SourceError for a file that cannot be read, or that is neither in version 2 or 3.
+    """
     try:
-        with _lines(path, Faults()) as lines:
+        with lines_of(path, Faults()) as lines:
             head = [line for line in islice(lines, HEADER_LINES) if line[60:80].strip() == "RINEX VERSION / TYPE"]
     except OSError as error:
         raise SourceError(f"source {url!r}: {str(path)!r} cannot be read: {error.strerror}") from error
