@@ -58,9 +58,45 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("--quiet", action="store_true", help="no progress bar")
     info.set_defaults(run=_info)
 
-    for command in (process, run):
+    record = commands.add_parser("record", help="record everything on the bus into a file until it is stopped")
+    record.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the recording")
+    record.set_defaults(run=_record)
+
+    replay = commands.add_parser("replay", help="publish what was recorded, at the pace at which it came")
+    replay.add_argument("recording", type=Path, metavar="F.mcap")
+    replay.add_argument("--speed", type=float, default=1.0, metavar="S", help="2 is twice as fast, inf all at once")
+    replay.add_argument("--start", type=float, default=0.0, metavar="s", help="seconds from the start of the recording")
+    replay.add_argument("--end", type=float, default=float("inf"), metavar="s", help="seconds from its start")
+    replay.add_argument("--loop", action="store_true", help="begin again after the end")
+    replay.add_argument("--quiet", action="store_true", help="no progress bar")
+    replay.set_defaults(run=_replay)
+
+    check = commands.add_parser("check", help="find the devices and show how each is doing")
+    check.add_argument("--once", action="store_true", help="print once and end, for scripts")
+    check.add_argument("--json", action="store_true", help="for programs; implies --once")
+    check.set_defaults(run=_check)
+
+    _add_calibrate(commands.add_parser("calibrate", help="calibrate a camera, or a camera against the IMU"))
+
+    for command in (check, process, run, record, replay):
         command.add_argument("--config", type=Path, metavar="FILE", help="TOML file; without it the defaults hold")
     return parser
+
+
+def _add_calibrate(parser: argparse.ArgumentParser) -> None:
+    kinds = parser.add_subparsers(required=True, metavar="WHAT")
+    camera = kinds.add_parser("camera", help="intrinsics and distortion from images of a chessboard")
+    camera.add_argument("images", type=Path, metavar="IMAGES_DIR", help="folder of JPEG or PNG images")
+    camera.add_argument("--board", required=True, metavar="9x6", help="inner corners of the board, columns x rows")
+    camera.add_argument("--square", type=float, required=True, metavar="M", help="side of a square, m")
+    camera.set_defaults(run=_calibrate_camera)
+    imu = kinds.add_parser("imu-camera", help="rotation and time offset between camera and IMU, from a recording")
+    imu.add_argument("source", metavar="SOURCE", help="with camera frames and IMU samples, e.g. euroc:DIR or F.mcap")
+    imu.add_argument("--calibration", type=Path, required=True, metavar="F", help="intrinsics: our TOML, Kalibr, EuRoC")
+    imu.set_defaults(run=_calibrate_imu_camera)
+    for kind in (camera, imu):
+        kind.add_argument("--out", type=Path, metavar="F.toml", help="write the calibration here")
+        kind.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _process(args: argparse.Namespace) -> int:
@@ -77,10 +113,17 @@ def _process(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     from air.config import AirConfig
-    from air.nodes import fly
 
     log.setup()
-    return fly(load(args.config, AirConfig), args.source)
+    config = load(args.config, AirConfig)
+    url = args.source or config.source
+    if url.startswith("live:"):
+        from air.sensing import sense
+
+        return sense(config, url)
+    from air.nodes import fly
+
+    return fly(config, url)
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -107,6 +150,60 @@ def _info(args: argparse.Namespace) -> int:
     Console().print(shown)
     for problem in summary.problems:
         print(f"{problem.name}: {problem.text}")
+    return 0
+
+
+def _record(args: argparse.Namespace) -> int:
+    from air.config import AirConfig
+    from air.recorder import record
+
+    log.setup()
+    return record(load(args.config, AirConfig), args.out)
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from air.config import AirConfig
+    from air.replay import Passage, await_listener, paced, publish
+    from common.bus import ZenohBus
+    from common.clock import SystemClock
+    from common.recording.reader import Recording
+
+    recording = Recording(args.recording)
+    messages = paced(recording, Passage(args.speed, args.start, args.end, args.loop), SystemClock())
+    bus = ZenohBus(load(args.config, AirConfig).bus)
+    try:
+        await_listener(bus)
+        count = publish(tqdm(messages, unit=" messages", leave=False, disable=True if args.quiet else None), bus)
+    finally:
+        bus.close()
+    print(f"{count} messages of {args.recording}")
+    for problem in recording.problems:
+        print(f"{args.recording}: {problem}", file=sys.stderr)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from air.check import check
+    from air.config import AirConfig
+
+    return check(load(args.config, AirConfig), args.once, args.json, Console(file=sys.stdout))
+
+
+def _calibrate_camera(args: argparse.Namespace) -> int:
+    from air.calibration.command import calibrate_from_images
+
+    print(calibrate_from_images(args.images, args.board, args.square, args.out, args.quiet))
+    return 0
+
+
+def _calibrate_imu_camera(args: argparse.Namespace) -> int:
+    from air.calibration.command import calibrate_from_recording
+
+    print(calibrate_from_recording(args.source, args.calibration, args.out, args.quiet))
     return 0
 
 
