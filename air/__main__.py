@@ -58,6 +58,15 @@ def _parser() -> argparse.ArgumentParser:
     info.add_argument("--quiet", action="store_true", help="no progress bar")
     info.set_defaults(run=_info)
 
+    position = commands.add_parser("position", help="position and velocity of each GNSS epoch of a source, as a table")
+    position.add_argument("source", metavar="SOURCE", help="with raw measurements: ubx:F, rinex:OBS,NAV or F.mcap")
+    position.add_argument("--out", type=Path, required=True, metavar="F.csv", help="the table")
+    position.add_argument("--systems", default="GREJC", metavar="GREJC", help="GNSS to use, letters as in RINEX")
+    position.add_argument("--mask", type=float, default=10.0, metavar="DEG", help="least elevation of a satellite")
+    position.add_argument("--dual", action="store_true", help="remove the ionosphere by a second band")
+    position.add_argument("--quiet", action="store_true", help="no progress bar")
+    position.set_defaults(run=_position)
+
     record = commands.add_parser("record", help="record everything on the bus into a file until it is stopped")
     record.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the recording")
     record.set_defaults(run=_record)
@@ -124,6 +133,23 @@ def _run(args: argparse.Namespace) -> int:
     from air.nodes import fly
 
     return fly(config, url)
+
+
+def _position(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from air.gnss.settings import PositioningSettings
+    from air.positions import find_positions, in_words, write_positions
+    from air.sources.source import open_source
+
+    settings = PositioningSettings(args.systems, args.mask, ionosphere_free=args.dual)
+    source = open_source(args.source)
+    passing = tqdm(source, unit=" items", leave=False, disable=True if args.quiet else None)
+    for line in in_words(write_positions(args.out, find_positions(passing, settings))):
+        print(line)
+    for problem in source.problems:
+        print(f"{problem.name}: {problem.text}", file=sys.stderr)
+    return 0
 
 
 def _info(args: argparse.Namespace) -> int:
