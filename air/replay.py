@@ -36,9 +36,7 @@ class Passage:
 def paced(recording: Recording, passage: Passage, clock: Clock) -> Iterator[Recorded]:
     """The messages of a passage, each when its time has come. Raises SourceError when there is none."""
     first_ns = recording.first_ns + round(passage.start_s * 1e9)
-    last_ns = recording.last_ns + 1
-    if passage.end_s != float("inf"):
-        last_ns = min(last_ns, recording.first_ns + round(passage.end_s * 1e9))
+    last_ns = None if passage.end_s == float("inf") else recording.first_ns + round(passage.end_s * 1e9)
     given = True
     while given:
         given, begun_ns = False, clock.now_ns()

@@ -22,8 +22,9 @@ from common.recording.writer import ABOUT
 MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES = 256_000_000
 MAX_PROBLEMS = 100
+FOREVER_NS = 1 << 64
 _RECORD = struct.Struct("<BQ")
-_CHUNK = struct.Struct("<QQQII")
+_CHUNK = struct.Struct("<QQQI8sQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _COMPRESSION = b"\x04\x00\x00\x00zstd"
 _OPCODES = {int(opcode) for opcode in Opcode}
@@ -89,8 +90,8 @@ class Recording:
 
         Chunks outside are not unpacked, unless the file has lost its index, which tells the channels.
         """
-        start = self.first_ns if start_ns is None else start_ns
-        end = self.last_ns + 1 if end_ns is None else end_ns
+        start = 0 if start_ns is None else start_ns
+        end = FOREVER_NS if end_ns is None else end_ns
         last_count: dict[int, int] = {}
         for chunk in self.chunks:
             outside = chunk.last_ns < start or chunk.first_ns >= end
@@ -108,7 +109,7 @@ class Recording:
                     continue
                 if channel.message_encoding != "msgpack":
                     continue
-                missing = count - last_count.get(channel_id, count - 1) - 1
+                missing = count - last_count.get(channel_id, 0 if start_ns is None else count - 1) - 1
                 last_count[channel_id] = count
                 if missing > 0:
                     self._tell(f"{missing} messages of {channel.topic} before message {count} are missing")
@@ -129,15 +130,12 @@ class Recording:
         while offset + _RECORD.size <= size:
             opcode, length = _RECORD.unpack_from(self._bytes, offset)
             body = offset + _RECORD.size
-            if opcode not in _OPCODES or length > size - body:
+            chunk = self._chunk_at(body, length)
+            if chunk is not None:
+                yield chunk
+            elif opcode == Opcode.CHUNK or not (self._plausible(offset) and self._plausible(body + length)):
                 offset = self._skip_damage(offset)
                 continue
-            if opcode == Opcode.CHUNK:
-                chunk = self._chunk_at(body, length)
-                if chunk is None:
-                    offset = self._skip_damage(offset)
-                    continue
-                yield chunk
             elif opcode in (Opcode.CHANNEL, Opcode.METADATA):
                 self._note(opcode, self._bytes[body : body + length])
             elif opcode == Opcode.FOOTER:
@@ -147,19 +145,30 @@ class Recording:
         if not self.whole:
             self._tell(f"it ends without its index at byte {size}: cut, or never closed; read up to there")
 
+    def _plausible(self, offset: int) -> bool:
+        """Whether a record may begin here, or the file end. A damaged length betrays itself by what follows."""
+        size = len(self._bytes)
+        if offset + _RECORD.size > size or self._bytes[offset : offset + len(MAGIC)] == MAGIC:
+            return offset <= size
+        opcode, length = _RECORD.unpack_from(self._bytes, offset)
+        return opcode in _OPCODES and length <= size - offset - _RECORD.size
+
     def _skip_damage(self, offset: int) -> int:
         """Where the next chunk may begin, past bytes that are no record."""
-        head = _RECORD.size + _CHUNK.size - 4
+        head = _RECORD.size + _CHUNK.size - 16
         found = self._bytes.find(_COMPRESSION, offset + 1 + head)
-        following = found - head if found >= 0 else len(self._bytes)
-        self._tell(f"bytes {offset} to {following} are no record and skipped")
-        return following
+        if found < 0:
+            return len(self._bytes)
+        self._tell(f"bytes {offset} to {found - head} are no record and skipped")
+        return found - head
 
     def _chunk_at(self, body: int, length: int) -> ChunkPlace | None:
-        if length < _CHUNK.size + 12 or self._bytes[body + _CHUNK.size - 4 : body + _CHUNK.size + 4] != _COMPRESSION:
+        """The chunk that a record holds, whatever its opcode says, or None when it does not look like one."""
+        if body + max(length, _CHUNK.size) > len(self._bytes):
             return None
-        first_ns, last_ns, _, _, _ = _CHUNK.unpack_from(self._bytes, body)
-        return ChunkPlace(body, length, first_ns, last_ns)
+        first_ns, last_ns, _, _, compression, packed = _CHUNK.unpack_from(self._bytes, body)
+        whole = compression == _COMPRESSION and packed == length - _CHUNK.size
+        return ChunkPlace(body, length, first_ns, last_ns) if whole else None
 
     def _note(self, opcode: int, record: bytes) -> None:
         stream = ReadDataStream(BytesIO(record))
@@ -191,8 +200,8 @@ class Recording:
 
     def _unpack(self, chunk: ChunkPlace) -> bytes:
         """The records of a chunk. Raises _DamagedError when they are not what the checksum says."""
-        _, _, size, checksum, _ = _CHUNK.unpack_from(self._bytes, chunk.offset)
-        packed = self._bytes[chunk.offset + _CHUNK.size + 4 + 8 : chunk.offset + chunk.length]
+        _, _, size, checksum, _, _ = _CHUNK.unpack_from(self._bytes, chunk.offset)
+        packed = self._bytes[chunk.offset + _CHUNK.size : chunk.offset + chunk.length]
         if size > MAX_CHUNK_BYTES:
             raise _DamagedError(f"it claims {size} bytes")
         try:
