@@ -21,6 +21,10 @@ class DeviceError(LuojiaError):
     """A device cannot be opened or read; the message names its place and what to do."""
 
 
+class CalibrationError(LuojiaError):
+    """A recording or a set of images cannot tell what is asked; the message names what is missing."""
+
+
 class BusError(LuojiaError):
     """The bus cannot be opened or reached; the message names the endpoint."""
 

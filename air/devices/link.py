@@ -50,7 +50,7 @@ def open_link(place: str, baud: int) -> Link:
         host, _, port = address.rpartition(":")
         return _TcpLink(host, int(port)) if kind == "tcp" else _UdpLink(host, int(port))
     except (OSError, ValueError, OverflowError) as error:
-        raise DeviceError(f"{place}: {_explained(place, error)}") from error
+        raise DeviceError(f"{place}: {explained(place, error)}") from error
 
 
 class _SerialLink:
@@ -129,8 +129,8 @@ class _UdpLink:
         self._socket.close()
 
 
-def _explained(place: str, error: Exception) -> str:
-    """What is wrong in one line, and what to do."""
+def explained(place: str, error: Exception) -> str:
+    """Why a place cannot be opened, in one line, and what to do."""
     number = getattr(error, "errno", None)
     if number in (errno.EBUSY, errno.EAGAIN, errno.EADDRINUSE):
         return "is held by another program; stop that program (luojia-air, gpsd, ModemManager)"

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from air.devices.link import Link, open_link
 from air.devices.settings import PortConfig
@@ -78,7 +78,9 @@ class Port:
             "refused": seen.refused,
             "frames": seen.frames.total(),
         }
-        return self._watch.status(time.monotonic(), counts)
+        status = self._watch.status(time.monotonic(), counts)
+        faults: tuple[str, ...] = getattr(self._driver, "faults", ())
+        return status if status.fault or not faults else replace(status, fault="; ".join(faults))
 
     def _run(self) -> None:
         failed = 0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
+from air.sensors.camera import StampPoint
 from common.config import Range
 from common.errors import ConfigError
 
@@ -17,14 +17,19 @@ _CAMERA = re.compile(r"/.+|realsense(:\w+)?")
 
 @dataclass(frozen=True)
 class PortConfig:
-    """A device behind a serial port, a TCP or UDP address, or nothing; `baud` counts for serial ports alone."""
+    """A device behind a serial port, a TCP or UDP address, or nothing; `baud` counts for serial ports alone.
+
+    `delay_s` is the least time from sampling to arrival.
+    """
 
     port: str = ""
     baud: Annotated[int, BAUD] = 115_200
+    delay_s: Annotated[float, Range(0.0, 1.0)] = 0.0
+    table: ClassVar[str] = "devices"
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a port that is no path and no address."""
-        _check("port", self.port, _LINK, "a path, tcp:HOST:PORT, udp:HOST:PORT, or nothing")
+        _check(f"{self.table}.port", self.port, _LINK, "a path, tcp:HOST:PORT, udp:HOST:PORT, or nothing")
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class GnssConfig(PortConfig):
     """The GNSS receiver (u-blox, UBX)."""
 
     baud: Annotated[int, BAUD] = 460_800
+    table: ClassVar[str] = "devices.gnss"
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class ImuConfig(PortConfig):
     """The IMU (Xsens, XBus)."""
 
     baud: Annotated[int, BAUD] = 921_600
+    table: ClassVar[str] = "devices.imu"
 
 
 @dataclass(frozen=True)
@@ -46,24 +53,27 @@ class MavlinkConfig(PortConfig):
     """The drone's telemetry (MAVLink)."""
 
     baud: Annotated[int, BAUD] = 57_600
+    table: ClassVar[str] = "devices.mavlink"
 
 
 @dataclass(frozen=True)
 class CameraConfig:
     """The camera: /dev/videoN for any V4L2 camera, realsense or realsense:SERIAL, or nothing.
 
-    `calibration` names a file that `read_calibration` reads; its line time counts.
+    `stamp` is what the stamps of a V4L2 camera mark. `calibration` names a file that `read_calibration` reads, or
+    nothing; its line time and its time offset count for the stamps.
     """
 
     device: str = ""
     width: Annotated[int, Range(16, 16_384)] = 1280
     height: Annotated[int, Range(16, 16_384)] = 720
     rate_hz: Annotated[float, Range(0.1, 1000.0)] = 30.0
-    calibration: Path | None = None
+    stamp: StampPoint = StampPoint.READOUT
+    calibration: str = ""
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a device that is neither."""
-        _check("device", self.device, _CAMERA, "/dev/videoN, realsense, realsense:SERIAL, or nothing")
+        _check("devices.camera.device", self.device, _CAMERA, "/dev/videoN, realsense, realsense:SERIAL, or nothing")
 
 
 @dataclass(frozen=True)

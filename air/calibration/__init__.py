@@ -1,0 +1,1 @@
+"""Calibration from recordings: a camera by itself, and against the IMU."""

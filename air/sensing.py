@@ -1,0 +1,78 @@
+"""The node of the devices: what they measure goes onto the local bus, and how each is doing, every second."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+
+from air.config import AirConfig
+from air.sources.live import Live
+from air.sources.source import open_source
+from common.bus import Bus, ZenohBus
+from common.clock import Clock, SystemClock
+from common.errors import BusError, SourceError, WireError
+from common.keys import alive_key, message_key
+from common.measurements import Measurement
+from common.messages import Health, Message
+from common.streams import HEALTH, RTCM, STREAMS, Stream
+from common.wire import encode
+
+log = logging.getLogger(__name__)
+
+ROLE = "sensing"
+BEAT_S = 1.0
+STREAM_OF: dict[type[Message], Stream] = {stream.message: stream for stream in STREAMS if stream is not RTCM}
+"""Where each kind of measurement goes; corrections are no measurement of ours."""
+
+
+def sense(config: AirConfig, url: str) -> int:
+    """Exit code 0 after SIGINT or SIGTERM; until then publishes what the devices of a `live:` source measure.
+
+    `live:` alone takes the devices of `config`. Raises SourceError, ConfigError and BusError.
+    """
+    live = Live(url, config.devices) if url == "live:" else open_source(url)
+    if not isinstance(live, Live):
+        raise SourceError(f"source {url!r} is no live source; use live: or live:FILE.toml")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: live.close())
+    bus = ZenohBus(config.bus)
+    sensing = Sensing(live, bus, config.vehicle, SystemClock())
+    try:
+        sensing.run()
+    finally:
+        live.close()
+        bus.close()
+    return 0
+
+
+class Sensing:
+    """Source → bus, until the source is closed."""
+
+    def __init__(self, live: Live, bus: Bus, vehicle: str, clock: Clock) -> None:
+        self._live, self._bus, self._vehicle, self._clock = live, bus, vehicle, clock
+        self._ended = threading.Event()
+        self._beat = threading.Thread(target=self._beat_on, name="beat", daemon=True)
+
+    def run(self) -> None:
+        """Publish all that comes. Raises BusError."""
+        alive = self._bus.declare_alive(alive_key(self._vehicle, ROLE))
+        self._beat.start()
+        try:
+            for measurement in self._live:
+                self._publish(STREAM_OF[type(measurement)], measurement)
+        finally:
+            self._ended.set()
+            alive.close()
+
+    def _beat_on(self) -> None:
+        while not self._ended.wait(BEAT_S):
+            for status in self._live.statuses():
+                self._publish(HEALTH, status.health(self._clock.now_ns()))
+
+    def _publish(self, stream: Stream, message: Measurement | Health) -> None:
+        try:
+            self._bus.publish(message_key(self._vehicle, stream, message), encode(message), stream)
+        except (WireError, BusError) as error:
+            if not self._ended.is_set():
+                log.warning("not published: %s", error)
