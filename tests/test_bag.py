@@ -310,7 +310,7 @@ def test_messages_that_make_no_sense_are_counted_and_left_out(tmp_path: Path) ->
 
 def test_a_damaged_bag_is_read_as_far_as_possible_or_refused_in_one_line(tmp_path: Path) -> None:
     whole = write_bag(tmp_path / "f.bag", ros1=True).read_bytes()
-    rng, outcomes = np.random.default_rng(1), {"read": 0, "refused": 0}
+    rng, read, refusals = np.random.default_rng(1), 0, []
     for trial in range(60):
         damaged = bytearray(whole if trial % 2 else whole[: int(rng.integers(len(whole)))])
         for at in rng.integers(0, max(len(damaged), 1), 3 if trial % 2 else 0):
@@ -318,12 +318,12 @@ def test_a_damaged_bag_is_read_as_far_as_possible_or_refused_in_one_line(tmp_pat
         (tmp_path / "d.bag").write_bytes(damaged)
         try:
             list(open_source(f"bag:{tmp_path / 'd.bag'}"))
-            outcomes["read"] += 1
+            read += 1
         except SourceError as error:
-            assert "\n" not in str(error)
-            outcomes["refused"] += 1
-    assert outcomes["read"] > 0
-    assert outcomes["refused"] > 0
+            refusals.append(str(error))
+    assert read > 0
+    assert refusals
+    assert not any("\n" in text for text in refusals)
 
 
 @pytest.mark.parametrize(("path", "named"), [("none.bag", "does not exist"), ("empty", "no bag"), ("x.bag", "no bag")])

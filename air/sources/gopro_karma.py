@@ -17,6 +17,8 @@ from common.arrays import F64
 from common.measurements import FixKind, ReceiverSolution, VehicleState
 
 DRONE, SYSTEM = "karma", 1
+LONGEST_S = 86_400.0
+"""Stamps further than this from the start of the video are damaged."""
 _KINDS = {2: FixKind.FIX_2D, 3: FixKind.FIX_3D, 4: FixKind.DIFFERENTIAL, 5: FixKind.RTK_FLOAT, 6: FixKind.RTK_FIXED}
 
 
@@ -83,8 +85,9 @@ def vehicle_states(telemetry: Telemetry) -> Iterator[VehicleState]:
 
 def _sound(telemetry: Telemetry, key: str, columns: int) -> Iterator[F64]:
     """Rows without gaps, in the order of the drone's clock; none without that clock."""
-    if boot_time_of_video(telemetry) is not None:
-        rows = [row for row in telemetry.rows(key, columns) if np.isfinite(row).all()]
+    boot_s = boot_time_of_video(telemetry)
+    if boot_s is not None:
+        rows = [r for r in telemetry.rows(key, columns) if np.isfinite(r).all() and abs(r[0] - boot_s) < LONGEST_S]
         yield from sorted(rows, key=lambda row: float(row[0]))
 
 

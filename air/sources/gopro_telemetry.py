@@ -22,6 +22,10 @@ RECEIVER = "gopro"
 HERO5_ORDER = "ZXY"
 _BODY_OF = {"X": (1, 1.0), "Y": (0, -1.0), "Z": (2, 1.0)}
 """Row and sign of the camera's axes in `body`."""
+MOST_SAMPLES = 1e9
+"""A larger count is damaged."""
+FARTHEST_S = 2.0
+"""How far the steady rate may lead from where a sample's payload lies; two payloads."""
 UERE = 3.0
 """m. Error of one range, which the dilution of precision turns into one of position."""
 _KINDS = {2: FixKind.FIX_2D, 3: FixKind.FIX_3D}
@@ -60,15 +64,17 @@ def sample_times(series: list[tuple[Payload, Series]]) -> F64:
     samples are spread evenly over their payload.
     """
     counts = [len(s.values) for _, s in series]
+    spread = [p.start_s + p.duration_s * np.arange(n) / max(n, 1) for (p, _), n in zip(series, counts, strict=True)]
+    evenly = np.concatenate([np.zeros(0), *spread])
     ends_s = np.array([p.start_s + p.duration_s for p, _ in series])
-    totals = np.array([s.numbers.get("TSMP", np.full(1, np.nan))[0] for _, s in series])
-    if len(series) < 3 or not np.all(np.diff(totals) > 0) or not np.all(np.diff(ends_s) > 0):
-        spread = [p.start_s + p.duration_s * np.arange(n) / n for (p, _), n in zip(series, counts, strict=True) if n]
-        return np.concatenate([np.zeros(0), *spread])
-    full = np.array(counts) > 0.9 * np.median(counts)  # the last payload is not, but lasts as long as the others
+    totals = np.array([_number(s, "TSMP") for _, s in series])
+    full = np.array(counts) > 0.9 * np.median(counts or [0])  # the last is not, but lasts as long as the others
+    if full.sum() < 3 or not np.all(np.diff(totals) > 0) or not totals[-1] < MOST_SAMPLES:
+        return evenly
     period_s, start_s = np.polyfit(totals[full], ends_s[full], 1)
     indices = [total + np.arange(-n, 0) for total, n in zip(totals, counts, strict=True)]
-    return np.asarray(start_s + period_s * np.concatenate(indices))
+    steady = np.asarray(start_s + period_s * np.concatenate(indices))
+    return steady if np.abs(steady - evenly).max() < FARTHEST_S else evenly
 
 
 def imu_samples(telemetry: Telemetry) -> Iterator[ImuSample]:
