@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from common.errors import ConfigError
+
+SYSTEMS = "GREJC"
+
 
 @dataclass(frozen=True)
 class PositioningSettings:
@@ -14,7 +18,7 @@ class PositioningSettings:
     was excluded; its residuals must be such as good ranges exceed once in a thousand times.
     """
 
-    systems: str = "GREJC"
+    systems: str = SYSTEMS
     elevation_mask_deg: float = 10.0
     min_cn0: float = 25.0
     ionosphere_free: bool = False
@@ -26,3 +30,9 @@ class PositioningSettings:
     max_speed: float = 300.0
     sigma_doppler: float = 0.2
     """One sigma of a range rate, m/s, where the receiver does not know it to be worse."""
+
+    def __post_init__(self) -> None:
+        if not self.systems or not set(self.systems) <= set(SYSTEMS):
+            raise ConfigError(f"systems is {self.systems!r}; allowed are letters of {SYSTEMS}")
+        if not 0.0 <= self.elevation_mask_deg < 90.0:
+            raise ConfigError(f"elevation_mask_deg is {self.elevation_mask_deg}; allowed is 0 to 90")
