@@ -23,6 +23,9 @@ EPHEMERIS = Layout(
     STRING_BITS,
     (
         unsigned("string1", 1, (1, 2, 4)),
+        unsigned("tk_hours", 1, (1, 10, 5)),
+        unsigned("tk_minutes", 1, (1, 15, 6)),
+        unsigned("tk_seconds", 30, (1, 21, 1)),
         magnitude("vx", 2**-20 * 1e3, (1, 22, 24)),
         magnitude("ax", 2**-30 * 1e3, (1, 46, 5)),
         magnitude("x", 2**-11 * 1e3, (1, 51, 27)),
@@ -104,13 +107,22 @@ def ephemeris(parts: Sequence[int], satellite: str, channel: int, t_ns: int, lea
     )
 
 
-def strings(eph: GlonassEphemeris, frame: int, leap_s: int) -> list[tuple[int, ...]]:
-    """Strings 1 to 4 in the receiver's words of 32 bits. Raises ValueError naming a value that does not fit."""
+def strings(eph: GlonassEphemeris, sent_ns: int, leap_s: int) -> list[tuple[int, ...]]:
+    """Strings 1 to 4 of the frame sent at a time in GPST, ns, each in four of the receiver's words of 32 bits.
+
+    The date (N4, NT) is left out. Raises ValueError naming a value that the message cannot hold.
+    """
+    moscow_s = sent_ns // SECOND_NS - leap_s + MOSCOW_MINUS_UTC_S
+    of_day_s = moscow_s % 86_400
+    frame = of_day_s // 150 << 16 | of_day_s % 150 // 30 + 1
     values = {
         **{f"string{i}": i for i in range(1, 5)},
         **dict(zip(("x", "y", "z"), eph.position, strict=True)),
         **dict(zip(("vx", "vy", "vz"), eph.velocity, strict=True)),
         **dict(zip(("ax", "ay", "az"), eph.acceleration, strict=True)),
+        "tk_hours": of_day_s // 3600,
+        "tk_minutes": of_day_s % 3600 // 60,
+        "tk_seconds": of_day_s % 60 // 30 * 30,
         "tau": -eph.tau,
         "gamma": eph.gamma,
         "tb": (eph.toe_ns // SECOND_NS + MOSCOW_MINUS_UTC_S - leap_s) % 86_400,

@@ -85,11 +85,11 @@ def word(words: Sequence[int]) -> int | None:
 
 
 def page(word: int) -> tuple[int, ...]:
-    """The receiver's eight words of 32 bits with a word of 128 bits; reserved bits are zero."""
+    """A word of 128 bits in the receiver's words of 32: eight, and an empty one, as an F9P has for E1-B."""
     even = word >> 16 << _HALF_BITS - 114
     odd = 0b10 << _HALF_BITS - 2 | (word & 0xFFFF) << _HALF_BITS - 18
     odd |= _crc(even, odd) << _HALF_BITS - 106
-    return split(even << _HALF_BITS | odd, _WORDS, 32)
+    return (*split(even << _HALF_BITS | odd, _WORDS, 32), 0)
 
 
 def _crc(even: int, odd: int) -> int:
