@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from device_ports import LineDriver, VirtualPort, wait_for
 
-from air.devices.link import open_link
 from air.devices.port import Arrival, Port
 from air.devices.settings import PortConfig
 from air.devices.status import State
 from common.errors import DeviceError
+from common.link import open_link
 from common.measurements import RawBytes, ReceiverSolution
 
 

@@ -16,11 +16,11 @@ from typing import Any
 import av
 import av.error
 
-from air.devices.link import explained
 from air.devices.settings import CameraConfig
 from air.sensors.camera import Shot
 from air.sensors.driver import TimeScale
 from common.errors import DeviceError
+from common.link import explained
 from common.measurements import Encoding
 
 OPEN_S, READ_S = 3.0, 2.0

@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from air.devices.link import Link, open_link
 from air.devices.settings import PortConfig
 from air.devices.status import DeviceStatus, State, Watch
 from air.sensors.driver import Driver, TimeScale
 from common.errors import DeviceError
+from common.link import Link, open_link
 from common.measurements import Measurement, RawBytes
 
 log = logging.getLogger(__name__)
