@@ -118,11 +118,18 @@ def _glonass(e: GlonassEphemeris) -> Iterator[str]:
 
 def _start(satellite: str, t_ns: int, clock: tuple[float, float, float]) -> str:
     moment = to_calendar(t_ns) + timedelta(milliseconds=500)
-    return f"{satellite} {moment:%Y %m %d %H %M %S}" + "".join(f"{value:19.12E}" for value in clock)
+    return f"{satellite} {moment:%Y %m %d %H %M %S}" + "".join(_number(value) for value in clock)
 
 
 def _orbit(*values: float) -> str:
-    return "    " + "".join(f"{value:19.12E}" for value in values)
+    return "    " + "".join(_number(value) for value in values)
+
+
+def _number(value: float) -> str:
+    """Nineteen columns, blank for what is no number; exponents have room for two digits."""
+    if not abs(value) < 1e100:
+        return " " * 19
+    return f"{value if abs(value) >= 1e-99 else 0.0:19.12E}"
 
 
 def _codes(epochs: Sequence[GnssEpoch]) -> dict[str, list[str]]:
