@@ -12,6 +12,8 @@ from common.config import Range
 from common.errors import ConfigError
 from common.export.surface import MIN_VIEWS
 
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
+
 
 @dataclass(frozen=True)
 class StationBus:
@@ -58,6 +60,27 @@ class ViewerConfig:
 
 
 @dataclass(frozen=True)
+class TelemetryConfig:
+    """The drone's own telemetry (MAVLink) at the ground; off without a `url`.
+
+    `url` is a path, tcp:HOST:PORT or udp:HOST:PORT (listens there); `baud` counts for serial ports alone. `vehicle`
+    is the aircraft's name on the bus, `system` its MAVLink system id (0: the first that is heard).
+    """
+
+    url: str = ""
+    baud: Annotated[int, Range(300, 4_000_000)] = 57_600
+    vehicle: str = "uav1"
+    system: Annotated[int, Range(0, 255)] = 0
+
+    def __post_init__(self) -> None:
+        if self.url and not re.fullmatch(r"/.+|(udp|tcp):[^:\s]*:\d{1,5}", self.url):
+            allowed = "a path, tcp:HOST:PORT, udp:HOST:PORT, or nothing"
+            raise ConfigError(f"telemetry.url is {self.url!r}; allowed: {allowed}")
+        if not _NAME.fullmatch(self.vehicle):
+            raise ConfigError(f"telemetry.vehicle is {self.vehicle!r}; allowed: 1 to 32 letters, digits, - and _")
+
+
+@dataclass(frozen=True)
 class GroundConfig:
     """One ground station; `station` is its name on the bus, `min_views` how many photos must agree on a cell."""
 
@@ -66,9 +89,10 @@ class GroundConfig:
     bus: StationBus = field(default_factory=StationBus)
     store: StoreConfig = field(default_factory=StoreConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
+    telemetry: TelemetryConfig = field(default_factory=TelemetryConfig)
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", self.station):
+        if not _NAME.fullmatch(self.station):
             raise ConfigError(f"station is {self.station!r}; allowed: 1 to 32 letters, digits, - and _")
         if self.bus.mode == "client" and not self.bus.connect:
             raise ConfigError("bus.connect is empty; a client needs the endpoint of a station, tcp/HOST:7447")

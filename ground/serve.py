@@ -11,6 +11,7 @@ from ground.config import GroundConfig
 from ground.gateway import Gateway
 from ground.station import Station
 from ground.store import Store
+from ground.telemetry import TelemetryNode
 from ground.viewer.viewer import Viewer
 
 
@@ -31,4 +32,8 @@ def running(config: GroundConfig) -> Iterator[Viewer | None]:
             stack.callback(viewer.close)
         stack.callback(gateway.close)
         gateway.start()
+        if config.telemetry.url:
+            telemetry = TelemetryNode(config.telemetry, bus, SystemClock())
+            stack.callback(telemetry.close)
+            telemetry.start()
         yield viewer

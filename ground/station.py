@@ -11,6 +11,7 @@ from common.bus_memory import intersects
 from common.errors import WireError
 from common.export.surface import MIN_VIEWS
 from common.keys import parse_key, stream_key, tile_key
+from common.measurements import VehicleState
 from common.messages import Datum, Health, Keyframe, Level, MapDigest, MapTile, Pose, TileRequest
 from common.streams import DATUM, DIGEST, KEYFRAME, TILE, Stream
 from common.wire import decode, encode
@@ -19,7 +20,7 @@ from ground.inbox import Inbox, Received, StreamCount
 from ground.resync import Resync
 from ground.store import Held
 from ground.tracks import Tracks
-from ground.viewer.scene import Aircraft, HealthRow, Scene, StreamRow
+from ground.viewer.scene import Aircraft, HealthRow, Scene, StreamRow, VehicleRow
 
 GROUND_ROLE = "ground"
 HEARD_NS = 3_000_000_000
@@ -47,6 +48,7 @@ class Station:
         self._resync = Resync()
         self._roles: dict[str, set[str]] = {}
         self._health: dict[tuple[str, str], tuple[Health, int]] = {}
+        self._states: dict[str, tuple[VehicleState, int]] = {}
 
     def receive(self, key: str, payload: bytes, now_ns: int) -> Outcome:
         """Take in bytes that came under a key; bad ones are counted and change nothing."""
@@ -66,6 +68,8 @@ class Station:
                 return Outcome(self.cloud.add_datum(vehicle, datum, payload))
             case MapDigest() as digest:
                 return Outcome(vehicle=vehicle, request=self._due(vehicle, digest, received.arrival_ns))
+            case VehicleState() as state:
+                self._states[vehicle] = (state, received.arrival_ns)
             case Health() as health:
                 self._health[vehicle, health.role] = (health, received.arrival_ns)
         return Outcome()
@@ -153,6 +157,10 @@ class Station:
             health=[
                 HealthRow(vehicle, role, health.level, health.text, (now_ns - arrival_ns) / 1e9)
                 for (vehicle, role), (health, arrival_ns) in sorted(self._health.items())
+            ],
+            vehicles=[
+                VehicleRow(vehicle, state, (now_ns - arrival_ns) / 1e9)
+                for vehicle, (state, arrival_ns) in sorted(self._states.items())
             ],
             faults=self.inbox.faults,
             station=self.name,

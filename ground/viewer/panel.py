@@ -8,6 +8,7 @@ from html import escape
 import viser
 
 from common.messages import Level
+from ground.viewer.drone import drone_lines
 from ground.viewer.points import SIGMA_RANGE, VIEWS_RANGE, Colouring, Style
 from ground.viewer.scene import Scene, StreamRow
 
@@ -79,12 +80,13 @@ def _write(handle: viser.GuiHtmlHandle, html: str) -> None:
 
 def _summary(scene: Scene, drawn_points: int) -> str:
     lines = [_line(*_link(vehicle, alive, scene)) for vehicle, alive in sorted(scene.alive.items())]
+    lines += [_line(colour, text) for row in scene.vehicles for colour, text in drone_lines(row)]
     lines += [
         _line(_DOT[row.level], f"{row.vehicle} {row.role}: {row.text or row.level}")
         for row in scene.health
         if row.text or row.level != Level.OK
     ]
-    if not scene.alive and not scene.tiles:
+    if not scene.alive and not scene.tiles and not scene.vehicles:
         lines = [_line("#868e96", "Waiting for an aircraft: nothing has arrived yet.")]
     elif not scene.tiles:
         lines.append(_line("#868e96", "No map yet: tiles appear as soon as the first photos match."))

@@ -10,6 +10,7 @@ import numpy as np
 
 from common.arrays import F64
 from common.geo import T_world_other
+from common.measurements import VehicleState
 from common.messages import Datum, Level, Pose
 from common.se3 import SE3
 from ground.cloud import FlightId, HeldKeyframe, HeldTile
@@ -53,6 +54,15 @@ class HealthRow:
 
 
 @dataclass(frozen=True, eq=False)
+class VehicleRow:
+    """What a drone's autopilot said last."""
+
+    vehicle: str
+    state: VehicleState
+    age_s: float
+
+
+@dataclass(frozen=True, eq=False)
 class PlacedTile:
     """A tile that can be drawn, and where its world lies in the scene."""
 
@@ -72,6 +82,7 @@ class Scene:
     alive: dict[str, bool] = field(default_factory=dict)
     streams: Sequence[StreamRow] = ()
     health: Sequence[HealthRow] = ()
+    vehicles: Sequence[VehicleRow] = ()
     faults: int = 0
     station: str = "ground"
 
