@@ -73,17 +73,19 @@ def turn_between(before: F64, after: F64, inlier: float) -> F64 | None:
     # Of the two rotations of an essential matrix the other one is half a turn away, which no frame is from the next.
     R, twisted, travel = (np.asarray(part) for part in cv2.decomposeEssentialMat(E))
     R = min((R, twisted), key=lambda R: -np.trace(R)).T
-    return rotation_vector(_refined(R, -R @ travel.ravel(), before[used], after[used], inlier))
+    return rotation_vector(_refined(R, -R @ travel.ravel(), before[used], after[used]))
 
 
-def _refined(R: F64, travel: F64, before: F64, after: F64, inlier: float) -> F64:
+def _refined(R: F64, travel: F64, before: F64, after: F64) -> F64:
+    """The rotation after Gauss–Newton with Cauchy's weights, which forget tracks that are far off."""
     for _ in range(ROUNDS):
         aside = np.linalg.svd(travel[None])[2][1:]  # two directions across the travel
         residual = _sampson(R, travel, before, after)
         steps = [(rotation_vector_to_matrix(1e-6 * axis) @ R, travel) for axis in np.eye(3)]
         steps += [(R, travel + 1e-6 * axis) for axis in aside]
         J = np.stack([(_sampson(*step, before, after) - residual) / 1e-6 for step in steps], axis=1)
-        weight = 1.0 / np.maximum(1.0, np.abs(residual) / (0.3 * inlier))
+        scale = 2.0 * np.median(np.abs(residual)) + 1e-9
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
         H = J.T @ (J * weight[:, None])
         change = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(5), J.T @ (weight * residual))
         R = rotation_vector_to_matrix(change[:3]) @ R
