@@ -53,15 +53,18 @@ class StalledError(Exception):
     """A reader took longer than it may."""
 
 
-def fuzz(reader: Reader, seconds: float, seed: int = 0) -> Outcome:
-    """The outcome of as many cases as fit into some seconds. Raises AssertionError, naming the case, at a failure."""
+def fuzz(reader: Reader, seconds: float, seed: int = 0, cpu_s: float = CPU_S) -> Outcome:
+    """The outcome of as many cases as fit into some seconds, each of which may take `cpu_s`.
+
+    Raises AssertionError, naming the case, at a failure.
+    """
     cases, slowest, peak, before = 0, 0.0, 0, _resident_bytes()
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         case = mutated(reader, seed, cases)
         measured = cases % MEASURED == 0
         try:
-            took, held = _run(reader, case, measured)
+            took, held = _run(reader, case, measured, cpu_s)
         except Exception as error:
             raise AssertionError(f"{reader.name}: case {cases} of seed {seed}: {error!r}") from error
         assert held <= PEAK_BYTES, f"{reader.name}: case {cases} of seed {seed} held {held} bytes"
@@ -142,18 +145,18 @@ def _seeds(reader: Reader) -> list[bytes]:
     return [seed[:LONGEST] for seed in reader.seeds()]
 
 
-def _run(reader: Reader, data: bytes, measured: bool) -> tuple[float, int]:
+def _run(reader: Reader, data: bytes, measured: bool, cpu_s: float) -> tuple[float, int]:
     """CPU time of a case, s (0 where memory was measured), and the most bytes that it held (0 where it was not)."""
     if measured:
         tracemalloc.start()
         try:
-            with _limited(10 * CPU_S):
+            with _limited(10 * cpu_s):
                 reader.read(data)
             return 0.0, tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
     begun = time.process_time()
-    with _limited(CPU_S):
+    with _limited(cpu_s):
         reader.read(data)
     return time.process_time() - begun, 0
 

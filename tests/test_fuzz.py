@@ -41,7 +41,7 @@ def test_a_reader_that_stalls_is_stopped() -> None:
             pass
 
     with pytest.raises(AssertionError, match=r"endless: case 0 of seed 0: StalledError"):
-        fuzz(Reader("endless", read, lambda: [b"abcd"]), seconds=5.0)
+        fuzz(Reader("endless", read, lambda: [b"abcd"]), seconds=5.0, cpu_s=0.05)
 
 
 def test_a_reader_that_takes_all_memory_is_found() -> None:
