@@ -24,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
     ("url", "named"),
     [
         ("", ["photos", "sim"]),
-        ("flight.mcap", ["flight.mcap", "photos", "sim"]),
+        ("flight.mcap", ["flight.mcap", "No such file"]),
         ("rtsp://camera", ["rtsp", "photos", "sim"]),
         ("photos:no/such/folder", ["no/such/folder", "does not exist"]),
         ("photos:{folder}?speed=2", ["takes none"]),
