@@ -14,6 +14,7 @@ _BY_PRODUCT = {
     (0x1546, 0x01A8): "GNSS receiver u-blox 8",
     (0x1546, 0x01A9): "GNSS receiver u-blox F9",
     (0x2639, 0x0300): "IMU Xsens MTi",
+    **{(0x0403, product): "IMU Xsens on a converter cable" for product in range(0xD388, 0xD390)},
 }
 _BY_VENDOR = {
     0x0403: "serial adapter FTDI",
