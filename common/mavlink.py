@@ -128,6 +128,25 @@ def _end(held: bytes, marker: int) -> int | None:
     return marker + _OVERHEAD[held[marker]] + held[marker + 1] + signature
 
 
+class PacketWriter:
+    """Writes the messages of one sender, MAVLink 2, numbered as they come."""
+
+    def __init__(self, system: int = 1, component: int = 1) -> None:
+        self._mavlink = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+
+    def pack(self, name: str, **values: Any) -> bytes:
+        """The bytes of a message by its name, e.g. ATTITUDE; values that are not given are zero.
+
+        Raises AttributeError for an unknown message, TypeError for an unknown value.
+        """
+        kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
+        lengths = zip(kind.ordered_fieldnames, kind.array_lengths, strict=True)
+        zeros = {field: [0] * length if length else 0 for field, length in lengths}
+        data = bytes(kind(**(zeros | values)).pack(self._mavlink))
+        self._mavlink.seq = (self._mavlink.seq + 1) % 256
+        return data
+
+
 class Telemetry:
     """The newest state of one vehicle, from the bytes of a link or a log.
 
