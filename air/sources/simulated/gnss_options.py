@@ -1,0 +1,104 @@
+"""What the simulated GNSS does, and every error with its size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from common.config import Range
+from common.errors import SourceError
+
+Size = Annotated[float, Range(0.0, 1000.0)]
+Switch = Annotated[int, Range(0, 1)]
+Intervals = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class GnssOptions:
+    """One sigma of each error, in m unless said otherwise; 0 turns an error off.
+
+    `nav` is a RINEX navigation file whose satellites fly instead of the nominal ones. Epochs come at `rate_hz` but
+    for the fraction `missing`; one tracked nothing below `mask_deg`. `cold` switches the receiver on at the start;
+    else it has been on for a minute.
+
+    Satellites: `orbit` and `satellite_clock` against what they broadcast. Air: `ionosphere` and `troposphere` scale
+    the broadcast models' delays, the `…_residual` (at the zenith) is what no model tells. Receiver: `clock` scales the
+    random walk of its oscillator, `clock_drift_ppm` is its largest mean drift; `inter_system` is a constant delay of
+    each system; `code`, `phase` and `doppler` (m/s) are white noise at 45 dBHz; `multipath` and `carrier_multipath`
+    are correlated over `multipath_s` seconds; `slips` of each carrier in an hour at 45 dBHz, more when weak;
+    `half_cycle` leaves new carriers unresolved for some seconds.
+
+    `outage` and `jamming` are seconds of the flight, such as 60-180 or 60-90,300-330: nothing is received, or C/N0
+    falls by `jamming_db`. `fault` satellites, from `fault_start` s on, are late by `fault_bias` and by `fault_ramp`
+    m/s, without saying so. `baud` is the speed of the serial line.
+    """
+
+    nav: str = ""
+    systems: str = "GREC"
+    rate_hz: Annotated[float, Range(0.1, 20.0)] = 10.0
+    missing: Annotated[float, Range(0.0, 0.95)] = 0.25
+    mask_deg: Annotated[float, Range(0.0, 60.0)] = 7.0
+    cold: Switch = 0
+    orbit: Size = 0.5
+    satellite_clock: Size = 0.4
+    ionosphere: Size = 1.0
+    ionosphere_residual: Size = 0.8
+    troposphere: Size = 1.0
+    troposphere_residual: Size = 0.1
+    clock: Size = 1.0
+    clock_drift_ppm: Annotated[float, Range(0.0, 10.0)] = 0.5
+    inter_system: Size = 1.0
+    code: Size = 0.3
+    phase: Size = 0.0015
+    doppler: Size = 0.03
+    multipath: Size = 2.0
+    carrier_multipath: Size = 0.002
+    multipath_s: Annotated[float, Range(1.0, 3600.0)] = 60.0
+    slips: Size = 1.0
+    half_cycle: Switch = 1
+    outage: str = ""
+    jamming: str = ""
+    jamming_db: Annotated[float, Range(0.0, 60.0)] = 20.0
+    fault: Annotated[int, Range(0, 50)] = 0
+    fault_bias: Annotated[float, Range(-1e6, 1e6)] = 50.0
+    fault_ramp: Annotated[float, Range(-100.0, 100.0)] = 0.0
+    fault_start: Annotated[float, Range(0.0, 1e6)] = 30.0
+    baud: Annotated[int, Range(9600, 10_000_000)] = 921_600
+
+
+PERFECT = GnssOptions(
+    missing=0.0,
+    orbit=0.0,
+    satellite_clock=0.0,
+    ionosphere_residual=0.0,
+    troposphere_residual=0.0,
+    clock=0.0,
+    clock_drift_ppm=0.0,
+    inter_system=0.0,
+    code=0.0,
+    phase=0.0,
+    doppler=0.0,
+    multipath=0.0,
+    carrier_multipath=0.0,
+    slips=0.0,
+    half_cycle=0,
+)
+"""No error but the air's delays, which the broadcast models tell exactly."""
+BASE = GnssOptions(rate_hz=1.0, missing=0.0, code=0.2, multipath=0.5, slips=0.2)
+"""A base station in the open, on a good antenna; of the satellites and the air it shares the flight's errors."""
+
+
+def intervals(text: str, key: str) -> Intervals:
+    """Times (start, end) in s, such as of 60-180 or 60-90,300-330. Raises SourceError naming the option."""
+    found = []
+    for part in filter(None, text.split(",")):
+        try:
+            start, end = (float(number) for number in part.split("-"))
+        except ValueError:
+            start, end = 0.0, -1.0
+        if not 0.0 <= start < end < float("inf"):
+            raise SourceError(
+                f"option {key!r} is {text!r}, must be seconds of the flight such as 60-180 or 60-90,300-330"
+            )
+        found.append((start, end))
+    return tuple(found)
