@@ -8,6 +8,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
 from air.gnss.bits import ura_m
 from air.gnss.gnss_time import SECOND_NS, from_week
 from common.measurements import GlonassEphemeris, Ionosphere, KeplerEphemeris
@@ -15,6 +16,8 @@ from common.measurements import GlonassEphemeris, Ionosphere, KeplerEphemeris
 SENT_NS = from_week(2370, 200_010.0)
 """The begin of a frame in GPST; of one in BDT it is 14 s late."""
 LEAP_S = 18
+Words = tuple[int, ...]
+SIGNAL = {"G": "1C", "J": "1C", "E": "1B", "C": "2I", "R": "1C"}
 
 
 def within(limit: float) -> st.SearchStrategy[float]:
@@ -140,7 +143,7 @@ def typical(satellite: str, source: str, **more: Any) -> KeplerEphemeris:
     return replace(eph, **more)
 
 
-TYPICAL_GLONASS = GlonassEphemeris(
+GLONASS = GlonassEphemeris(
     t_ns=SENT_NS,
     satellite="R07",
     toe_ns=from_week(2370, 200_700.0) + LEAP_S * SECOND_NS,
@@ -153,3 +156,19 @@ TYPICAL_GLONASS = GlonassEphemeris(
     age_days=1,
     health=0,
 )
+SOME = {
+    "LNAV": typical("G05", "LNAV"),
+    "INAV": typical("E12", "INAV"),
+    "D1": typical("C21", "D1"),
+    "D2": typical("C03", "D2"),
+}
+
+
+def pieces_of(eph: KeplerEphemeris | GlonassEphemeris) -> list[Words]:
+    if isinstance(eph, GlonassEphemeris):
+        return glonass_strings.strings(eph, SENT_NS, LEAP_S)
+    if eph.source == "LNAV":
+        return lnav.ephemeris_words(eph, SENT_NS)
+    if eph.source == "INAV":
+        return inav.pages(eph, SENT_NS)
+    return beidou_d1_d2.ephemeris_words(eph, Ionosphere(0, "C", (0.0,) * 4, (0.0,) * 4), SENT_NS + 14 * SECOND_NS)

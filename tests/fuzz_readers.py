@@ -9,11 +9,21 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from broadcast_samples import SENT_NS
+from broadcast_samples import GLONASS, SENT_NS, SIGNAL, SOME, pieces_of
 from conftest import DATA
+from fuzz_importers import (
+    bag_seeds,
+    dataflash_seeds,
+    gpmf_seeds,
+    read_dataflash,
+    read_file,
+    read_gpmf,
+    ulog_seeds,
+)
 from gnss_samples import NAVIGATION, OLD_OBSERVATIONS
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recording_samples import flight, write
+from ubx_samples import EPOCH, SOLUTION, STREAM
 
 from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
 from air.gnss.bits import split
@@ -78,8 +88,6 @@ def of_driver(name: str, driver: Callable[[], Driver], seeds: Callable[[], list[
 
 
 def _ubx_seeds() -> list[bytes]:
-    from test_gnss_ublox import STREAM
-
     return [STREAM, *recorded("gnss/nhm.ubx", (0, 6000), (100_000, 6000))]
 
 
@@ -92,9 +100,6 @@ def _ubx_messages(data: bytes) -> None:
 
 
 def _ubx_payloads() -> list[bytes]:
-    from test_gnss_ublox import EPOCH, SOLUTION
-    from test_navigation_message import GLONASS, SIGNAL, SOME, pieces_of
-
     pieces = [(eph.satellite, words) for eph in (*SOME.values(), GLONASS) for words in pieces_of(eph)]
     subframes = [pack_sfrbx(NavigationBits(name, SIGNAL[name[0]], 0, words)) for name, words in pieces]
     return [pack_rawx(EPOCH), pack_pvt(SOLUTION, 18), *subframes]
@@ -211,6 +216,10 @@ _ALL: tuple[Reader, ...] = (
     Reader("mcap", read_recording, recordings),
     *_GNSS,
     Reader("rinex", read_rinex, rinex_seeds),
+    Reader("gpmf", read_gpmf, gpmf_seeds),
+    Reader("dataflash", read_dataflash, dataflash_seeds),
+    Reader("ulog", partial(read_file, "ulog"), ulog_seeds),
+    Reader("bag", partial(read_file, "bag"), bag_seeds),
 )
 
 READERS = {reader.name: reader for reader in _ALL}

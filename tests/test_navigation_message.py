@@ -12,7 +12,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broadcast_samples import LEAP_S, SENT_NS, TYPICAL_GLONASS, beidous, glonasses, inavs, ionospheres, lnavs, typical
+from broadcast_samples import (
+    GLONASS,
+    LEAP_S,
+    SENT_NS,
+    SIGNAL,
+    SOME,
+    Words,
+    beidous,
+    glonasses,
+    inavs,
+    ionospheres,
+    lnavs,
+    pieces_of,
+    typical,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,24 +40,11 @@ from air.sensors.ubx_rawx import pack_rawx
 from air.sources.source import open_source
 from common.measurements import GlonassEphemeris, GnssEpoch, Ionosphere, KeplerEphemeris
 
-Words = tuple[int, ...]
-SIGNAL = {"G": "1C", "J": "1C", "E": "1B", "C": "2I", "R": "1C"}
-
 
 def heard(satellite: str, pieces: list[Words], into: NavigationMessages | None = None) -> list[Broadcast]:
     into = into or NavigationMessages()
     signal, channel = SIGNAL[satellite[0]], 5 if satellite[0] == "R" else 0
     return [m for words in pieces for m in into.add(satellite, signal, words, channel, SENT_NS, LEAP_S)]
-
-
-def pieces_of(eph: KeplerEphemeris | GlonassEphemeris) -> list[Words]:
-    if isinstance(eph, GlonassEphemeris):
-        return glonass_strings.strings(eph, SENT_NS, LEAP_S)
-    if eph.source == "LNAV":
-        return lnav.ephemeris_words(eph, SENT_NS)
-    if eph.source == "INAV":
-        return inav.pages(eph, SENT_NS)
-    return beidou_d1_d2.ephemeris_words(eph, Ionosphere(0, "C", (0.0,) * 4, (0.0,) * 4), SENT_NS + 14 * SECOND_NS)
 
 
 # Encoding and decoding
@@ -119,13 +120,6 @@ def test_a_layout_writes_what_it_reads(bits: int) -> None:
 # Collecting
 
 
-SOME = {
-    "LNAV": typical("G05", "LNAV"),
-    "INAV": typical("E12", "INAV"),
-    "D1": typical("C21", "D1"),
-    "D2": typical("C03", "D2"),
-}
-GLONASS = TYPICAL_GLONASS
 ALL = [*SOME.values(), GLONASS]
 each = pytest.mark.parametrize("eph", ALL, ids=[*SOME, "GLONASS"])
 

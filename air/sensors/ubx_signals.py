@@ -5,6 +5,8 @@ Source: u-blox F9 HPG 1.32, Interface Description (UBX-22008968), sections 1.5.2
 
 from __future__ import annotations
 
+from air.gnss.beidou_d1_d2 import GEOSTATIONARY
+
 GLONASS = 6
 _SATELLITES = {0: ("G", 1, 32, 0), 1: ("S", 120, 158, 100), 2: ("E", 1, 36, 0), 3: ("C", 1, 63, 0)} | {
     5: ("J", 1, 10, 0),
@@ -30,8 +32,8 @@ SATELLITE_NAMES = {
 SATELLITE_IDS = {name: ids for ids, name in SATELLITE_NAMES.items()}
 SIGNAL_NAMES = {(constellation, i): name for constellation, names in _SIGNALS.items() for i, name in names.items()}
 """(gnssId, sigId) → the last two letters of RINEX observation codes."""
-_GEOSTATIONARY = {f"C{number:02d}" for number in (*range(1, 6), *range(59, 64))}
 _D2 = {0: 1, 2: 3, 4: 10}
+"""sigId of a BeiDou signal with D1 → the same with D2."""
 
 
 def signal_id(satellite: str, signal: str) -> int:
@@ -40,4 +42,4 @@ def signal_id(satellite: str, signal: str) -> int:
     ids = [i for i, name in _SIGNALS[constellation].items() if name == signal]
     if not ids:
         raise KeyError(f"{satellite} has no signal {signal}")
-    return _D2.get(ids[0], ids[0]) if satellite in _GEOSTATIONARY else ids[0]
+    return _D2.get(ids[0], ids[0]) if satellite in GEOSTATIONARY else ids[0]

@@ -65,11 +65,11 @@ class DeviceFile:
             self._note(f"cannot be read to its end: {error.strerror}")
         counts = self._driver.counts
         if counts.dropped_bytes:
-            self._note(
-                f"{counts.dropped_bytes} of {counts.received_bytes} bytes in {counts.bursts} bursts are no frames"
-            )
+            self._note(f"bytes of no frame: {counts.dropped_bytes} of {counts.received_bytes}, bursts: {counts.bursts}")
+        if counts.missing:
+            self._note(f"frames that the device numbered and that never came: {counts.missing}")
         if counts.refused:
-            self._note(f"{counts.refused} frames arrived whole but made no sense, or had no time yet")
+            self._note(f"frames that made no sense, or had no time yet: {counts.refused}")
 
     def _note(self, text: str) -> None:
         self._problems.append(Problem(self._path.name, text))
