@@ -16,6 +16,8 @@ from air.sensors.driver import TimeScale
 from air.sensors.imu_xsens import TICK_NS, XsensImu
 from air.sensors.mtdata2 import NED, NWU, DataId, Precision, pack, unpack
 from air.sensors.xbus import MessageId, frame
+from air.sources.source import open_source
+from common.errors import SourceError
 from common.measurements import ImuSample
 from common.se3 import quaternion_to_matrix, rotation_vector, rotation_vector_to_matrix
 
@@ -91,6 +93,18 @@ def test_gyroscope_and_accelerometer_of_the_recording_agree_with_its_own_attitud
     up = np.mean([R @ s.accel for R, s in zip(attitudes, samples, strict=True)], axis=0)
     assert up[2] == pytest.approx(9.8, abs=0.25)  # this device reads 2 % too little
     assert np.hypot(up[0], up[1]) < 0.7  # 4°: real motion, and an accelerometer with an offset
+
+
+def test_a_file_is_a_source_that_tells_what_was_wrong(tmp_path: Path) -> None:
+    file = tmp_path / "imu.bin"
+    file.write_bytes(b"junk" + b"".join(message(i, 50 * i) for i in (0, 1, 2, 5)) + b"\xfa\xff")
+    source = open_source(f"xbus:{file}")
+    assert len(list(source)) == len(list(source)) == 4
+    dropped, missing = (problem.text for problem in source.problems)
+    assert dropped.startswith("bytes of no frame: 4 of ")
+    assert missing == "frames that the device numbered and that never came: 2"
+    with pytest.raises(SourceError, match=r"mission\.bin"):
+        open_source(f"xbus:{tmp_path / 'mission.bin'}")
 
 
 # Values
