@@ -89,3 +89,23 @@ DELAYS = (
     (340000, (0.5, -78.5, -30), (310, 88), 6.593139, 2.435091),
 )
 """Second of the week, place °, °, m, azimuth and elevation °, ionosphere at L1 and troposphere, m."""
+
+OLD_OBSERVATIONS = """\
+     2.11           OBSERVATION DATA    M (MIXED)           RINEX VERSION / TYPE
+     6    C1    P2    L1    D1    S1    S2                  # / TYPES OF OBSERV
+  2024     6    24     8    20    0.0000000     GPS         TIME OF FIRST OBS
+                                                            END OF HEADER
+ 24  6 24  8 20  0.0000000  0  3G06R01G 9
+  21111111.123    21111115.456   110000000.12315     -1234.500          45.000
+        40.000
+  19000000.000                   101000000.000         500.000          50.000
+
+  22222222.000
+
+                            4  1
+THIS IS A REMARK OF THE RECEIVER                            COMMENT
+ 24  6 24  8 20  1.0000000  0  1G06
+  21111112.123    21111116.456   110000005.12325     -1234.500          45.000
+        40.000
+"""
+"""Two epochs of RINEX 2.11 with a remark between them."""

@@ -184,6 +184,8 @@ def test_a_start_nearby_leads_to_the_same_place() -> None:
     cold, warm = solved(epoch), solved(epoch, near=WUHAN + 300.0)
     assert warm.position == pytest.approx(cold.position, abs=1e-5)
     assert warm.used == cold.used
+    lost = solved(epoch, near=-WUHAN)
+    assert lost.position == pytest.approx(cold.position, abs=1e-5)
 
 
 def test_sigma_tells_how_large_errors_are() -> None:
@@ -311,6 +313,7 @@ def test_positions_of_a_recording_are_those_of_rtklib(
     """RTKLIB gets the same measurements and the ephemerides that were used: of several it takes odd group delays."""
     items = list(open_source(RECORDINGS[name].format(gnss=real_data("gnss"))))
     epochs = [item for item in items if isinstance(item, GnssEpoch)]
+    epochs = epochs[:: 1 + len(epochs) // 120]
     broadcast = Ephemerides(items)
     used = {broadcast.find(s, epoch.t_ns) for epoch in epochs for s in set(epoch.satellites)} - {None}
     model = broadcast.ionosphere()
@@ -347,19 +350,18 @@ def both(
                 yield mine, theirs[i]
 
 
-def test_wild_epochs_of_a_recording_are_refused(real_data: Callable[[str], Path], tmp_path: Path) -> None:
+def test_wild_epochs_of_a_recording_are_refused(real_data: Callable[[str], Path]) -> None:
     """The signal fades until four satellites are left; RTKLIB then puts the antenna up to 69 km away."""
     gnss = real_data("gnss")
-    outcomes, broadcast = [], Ephemerides()
-    for item in open_source(RECORDINGS["16dBatt"].format(gnss=gnss)):
-        broadcast.add(item)
-        if isinstance(item, GnssEpoch):
-            outcomes.append(find_position(item, broadcast, PositioningSettings()))
+    items = list(open_source(RECORDINGS["16dBatt"].format(gnss=gnss)))
+    broadcast = Ephemerides(items)
+    epochs = [item for item in items if isinstance(item, GnssEpoch)][::3]
+    outcomes = [find_position(epoch, broadcast, PositioningSettings()) for epoch in epochs]
     found = [outcome.position for outcome in outcomes if isinstance(outcome, PointPosition)]
     off = np.linalg.norm(np.array(found) - np.median(found, axis=0), axis=1)
-    assert len(found) > 1000
+    assert len(found) > len(epochs) // 2
     assert off.max() < 60.0
-    assert len(outcomes) - len(found) > 500
+    assert len(outcomes) - len(found) > len(epochs) // 4
 
 
 def test_a_position_of_a_surveyed_antenna_is_within_metres(real_data: Callable[[str], Path]) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rtklib
-from gnss_samples import ALPHA, BETA, NAVIGATION
+from gnss_samples import ALPHA, BETA, NAVIGATION, OLD_OBSERVATIONS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,24 +27,6 @@ from common.errors import SourceError
 from common.measurements import GlonassEphemeris, GnssEpoch, Ionosphere, KeplerEphemeris
 
 START_NS = from_week(2320, 116_400.0)
-OLD_OBSERVATIONS = """\
-     2.11           OBSERVATION DATA    M (MIXED)           RINEX VERSION / TYPE
-     6    C1    P2    L1    D1    S1    S2                  # / TYPES OF OBSERV
-  2024     6    24     8    20    0.0000000     GPS         TIME OF FIRST OBS
-                                                            END OF HEADER
- 24  6 24  8 20  0.0000000  0  3G06R01G 9
-  21111111.123    21111115.456   110000000.12315     -1234.500          45.000
-        40.000
-  19000000.000                   101000000.000         500.000          50.000
-
-  22222222.000
-
-                            4  1
-THIS IS A REMARK OF THE RECEIVER                            COMMENT
- 24  6 24  8 20  1.0000000  0  1G06
-  21111112.123    21111116.456   110000005.12325     -1234.500          45.000
-        40.000
-"""
 
 
 def written(messages: list[KeplerEphemeris | GlonassEphemeris | Ionosphere]) -> Lines:

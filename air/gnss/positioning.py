@@ -74,10 +74,15 @@ class Refused:
 def find_position(
     epoch: GnssEpoch, broadcast: Ephemerides, settings: PositioningSettings, near: F64 | None = None
 ) -> PointPosition | Refused:
-    """Position of the antenna at an epoch, or why there is none. `near` (3,) m, ECEF, saves a few iterations."""
+    """Position of the antenna at an epoch, or why there is none.
+
+    `near` (3,) m, ECEF, saves a few iterations; where it leads nowhere the search starts from nothing.
+    """
     ranges = clean_ranges(epoch, broadcast, settings)
     ionosphere = broadcast.ionosphere() or TYPICAL
     fit = _fit(ranges, epoch.t_ns, ionosphere, settings, near)
+    if isinstance(fit, str) and near is not None:
+        fit = _fit(ranges, epoch.t_ns, ionosphere, settings, None)
     if isinstance(fit, str):
         return Refused(epoch.t_ns, fit, ranges.rejected)
     rejected = ranges.rejected | fit.rejected

@@ -52,7 +52,7 @@ def clean_ranges(epoch: GnssEpoch, broadcast: Ephemerides, settings: Positioning
     for satellite, indices in _by_satellite(epoch):
         ephemeris = broadcast.find(satellite, epoch.t_ns)
         reason, pseudorange, row = "", np.nan, -1
-        if satellite[0] not in settings.systems or satellite[0] not in CLOCKS:
+        if satellite[:1] not in settings.systems or satellite[:1] not in CLOCKS:
             reason = "system not used"
         elif ephemeris is None:
             reason = "no ephemeris"

@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
-from air.gnss.calendar import from_calendar, leap_seconds
+from air.gnss.calendar import YEARS, from_calendar, leap_seconds
 from air.gnss.gnss_time import BDT_MINUS_GPST_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS, nearest
 from air.gnss.orbit import is_geostationary
 from air.gnss.rinex_lines import Lines, number, numbers
+from air.gnss.signals import CHANNELS
 from common.measurements import GlonassEphemeris, Ionosphere, KeplerEphemeris
 
 _START = re.compile(r"([A-Z][ \d]\d|[ \d]\d) ")
@@ -120,9 +121,10 @@ def _moment(text: str) -> datetime | None:
         year, month, day, hour, minute, second = (float(part) for part in text.split())
         century = 0 if year > 99 else 1900 if year >= 80 else 2000
         start = datetime(int(year) + century, int(month), int(day), int(hour), int(minute))
-        return start + timedelta(seconds=second)
+        moment = start + timedelta(seconds=second)
     except (ValueError, OverflowError):
         return None
+    return moment if moment.year in YEARS else None
 
 
 def _kepler(satellite: str, moment: datetime, v: tuple[float, ...]) -> KeplerEphemeris | None:
@@ -179,7 +181,8 @@ def _source(satellite: str, v: tuple[float, ...]) -> str:
 
 def _glonass(satellite: str, moment: datetime, v: tuple[float, ...], old: bool) -> GlonassEphemeris | None:
     """`v` holds the clock (3) and three lines of position, velocity, acceleration and one more (4 each)."""
-    if any(x != x for x in v[:14] if x is not v[2]):
+    needed = (*v[:2], *v[3:14])
+    if any(x != x for x in needed):
         return None
     leap_ns = leap_seconds(moment) * SECOND_NS
     toe_ns = from_calendar(moment) + leap_ns
@@ -187,6 +190,9 @@ def _glonass(satellite: str, moment: datetime, v: tuple[float, ...], old: bool) 
     if not old and 0 <= v[2] < 604_800:
         sent_ns = _in_week(v[2], leap_ns, toe_ns)
     channel = _whole(v[10])
+    channel -= 256 if channel > 128 else 0  # some write the byte without its sign
+    if channel not in CHANNELS:
+        return None
     x, y, z = ((1e3 * v[i], 1e3 * v[i + 1], 1e3 * v[i + 2]) for i in (3, 7, 11))
     return GlonassEphemeris(
         t_ns=sent_ns,
@@ -197,7 +203,7 @@ def _glonass(satellite: str, moment: datetime, v: tuple[float, ...], old: bool) 
         acceleration=(x[2], y[2], z[2]),
         tau=v[0],
         gamma=v[1],
-        channel=channel - 256 if channel > 128 else channel,
+        channel=channel,
         age_days=_whole(v[14]),
         health=_whole(v[6]),
     )

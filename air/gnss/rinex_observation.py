@@ -177,13 +177,13 @@ def _time(text: str, header: _Header, old: bool = False) -> int | None:
         second, _, fraction = parts[5].partition(".")
         century = (1900 if year >= 80 else 2000) if old else 0
         start = datetime(year + century, month, day, hour, minute) + timedelta(seconds=int(second))
-        fraction_ns = int(fraction[:9].ljust(9, "0"))
+        t_ns = from_calendar(start) + int(fraction[:9].ljust(9, "0"))
     except (ValueError, IndexError, OverflowError):
         return None
     if len(parts) != 6:
         return None
     shift_ns = {"GLO": (header.leap_s or 18) * SECOND_NS, "BDT": -BDT_MINUS_GPST_NS}.get(header.time_system, 0)
-    return from_calendar(start) + fraction_ns + shift_ns
+    return t_ns + shift_ns
 
 
 def _epoch(
