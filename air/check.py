@@ -12,7 +12,8 @@ from typing import Protocol
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live as LiveDisplay
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from air.config import AirConfig
 from air.devices.finding import Found, everything
@@ -31,7 +32,8 @@ PATIENCE_S = 9.0
 """How long a device has to come up, or to be found at another baud rate, before a verdict for scripts."""
 SETTLED_S = 2.5
 REFRESH_S = 0.25
-_COLOURS = {State.ALIVE: "green", State.OPENED: "yellow", State.SILENT: "red", State.GARBLED: "red"}
+_COLOURS = {State.ALIVE: "yellow", State.OPENED: "yellow"}
+_UNDECIDED = (State.OPENED, State.SILENT, State.GARBLED)
 
 
 class Watcher(Protocol):
@@ -164,14 +166,13 @@ def _asked(config: AirConfig, endpoint: str) -> Asked | None:
 
 
 def _verdict(watcher: Watcher) -> Sequence[DeviceStatus]:
-    """The statuses once all devices are well, and have been for long enough to have a rate, or patience ends."""
+    """The statuses once they can be told: a rate takes a while, and a baud rate longer."""
     begun_s = time.monotonic()
     while True:
         statuses = watcher.statuses()
         waited_s = time.monotonic() - begun_s
-        if waited_s > PATIENCE_S or (waited_s > SETTLED_S and all(status.well for status in statuses)):
-            return statuses
-        if not statuses:
+        undecided = any(status.state in _UNDECIDED for status in statuses)
+        if not statuses or waited_s > (PATIENCE_S if undecided else SETTLED_S):
             return statuses
         time.sleep(REFRESH_S)
 
@@ -188,14 +189,16 @@ def _show_live(watcher: Watcher, told_by: str, console: Console) -> Sequence[Dev
 
 
 def _page(statuses: Sequence[DeviceStatus], found: Sequence[Found], told_by: str) -> RenderableType:
-    devices = Table("device", "where", "state", "rate", "age", "dropped", "what is wrong", title=f"told by {told_by}")
+    devices = Table("device", Column("where", overflow="fold"), "state", "rate", "age", "dropped")
     for status in statuses:
-        colour = _COLOURS.get(status.state, "red") if not status.fault else "red"
+        state = Text(status.state, "green" if status.well else _COLOURS.get(status.state, "red"))
         age = "–" if status.age_s is None else f"{status.age_s:.2f} s"
-        dropped = str(status.counts.get("dropped_bytes", 0))
-        row = (status.device, status.place, f"[{colour}]{status.state}[/]", f"{status.rate_hz:.1f} Hz", age, dropped)
-        devices.add_row(*row, status.fault)
+        dropped = f"{status.counts.get('dropped_bytes', 0)} bytes"
+        devices.add_row(status.device, status.place, state, f"{status.rate_hz:.1f} Hz", age, dropped)
+    faults = [Text(f"{status.device}: {status.fault}", "red") for status in statuses if status.fault]
     there = Table("plugged in", "what it is", "serial number")
     for thing in found:
-        there.add_row(thing.path, thing.what, thing.serial)
-    return Group(devices, there if found else "no serial port and no camera is plugged in")
+        there.add_row(thing.path, Text(thing.what), Text(thing.serial))
+    return Group(
+        Text(f"told by {told_by}"), devices, *faults, there if found else "no serial port and no camera is plugged in"
+    )

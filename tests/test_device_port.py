@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import itertools
 import random
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -155,3 +156,31 @@ def test_what_is_no_port_is_named(tmp_path: Path) -> None:
         open_link(str(tmp_path / "file"), 9600)
     with pytest.raises(DeviceError, match=r"tcp:127.0.0.1:1: nobody listens there"):
         open_link("tcp:127.0.0.1:1", 9600)
+
+
+def test_a_device_behind_an_address_is_read_as_well() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = probe.getsockname()
+    listener = Listener()
+    reader = Port(LineDriver(), PortConfig(f"udp:127.0.0.1:{address[1]}"), listener.take)
+    reader.start()
+    wait_for(lambda: reader.status().state is State.OPENED, 2.0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(b"#1\n#2\n", address)
+        wait_for(lambda: len(listener.solutions()) == 2, 2.0)
+    reader.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        reader = Port(LineDriver(), PortConfig(f"tcp:127.0.0.1:{server.getsockname()[1]}"), listener.take)
+        reader.start()
+        connection, _ = server.accept()
+        assert connection.recv(10) == b"go\n"
+        connection.sendall(b"#3\n")
+        wait_for(lambda: len(listener.solutions()) == 3, 2.0)
+        connection.close()  # and opened again
+        connection, _ = server.accept()
+        connection.sendall(b"#4\n")
+        wait_for(lambda: len(listener.solutions()) == 4, 2.0)
+        reader.close()
+        connection.close()
