@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from device_ports import Player, VirtualPort, evenly
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20.common import MAV_AUTOPILOT_GENERIC, MAV_TYPE_QUADROTOR, MAVLink
 
 from air.config import AirConfig
 from air.devices.finding import cameras, name_of
-from air.devices.settings import CameraConfig, DevicesConfig, ImuConfig
+from air.devices.settings import CameraConfig, DevicesConfig, ImuConfig, MavlinkConfig
 from air.devices.status import DeviceStatus, State, Watch
+from air.sensing import STREAM_OF
 from air.sources.live import Live
 from air.sources.source import open_source
 from common.clock import SystemClock
 from common.config import parse
 from common.errors import ConfigError, SourceError
-from common.measurements import ClockState, ImuSample, RawBytes
+from common.measurements import ClockState, ImuSample, Measurement, RawBytes, VehicleState
 from common.messages import Health
 from common.wire import decode, encode
 
@@ -142,3 +147,31 @@ def test_cameras_are_found_once_each(tmp_path: Path) -> None:
 def test_places_are_those_of_the_configured_devices() -> None:
     config = DevicesConfig(imu=ImuConfig("/dev/luojia-imu"), camera=CameraConfig("realsense:123"))
     assert config.places == {"imu": "/dev/luojia-imu", "camera": "realsense:123"}
+
+
+def test_the_drone_s_telemetry_is_heard_through_an_address() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        host, number = probe.getsockname()
+    live = Live("live:", DevicesConfig(mavlink=MavlinkConfig(f"udp:{host}:{number}")))
+    drone = MAVLink(None, srcSystem=7)
+    beat = drone.heartbeat_encode(MAV_TYPE_QUADROTOR, MAV_AUTOPILOT_GENERIC, 0, 0, 4).pack(drone)
+    ended = threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not ended.wait(0.05):
+                sender.sendto(beat, (host, number))
+
+    threading.Thread(target=send, daemon=True).start()
+    try:
+        state = next(item for item in live if isinstance(item, VehicleState))
+    finally:
+        ended.set()
+        live.close()
+    assert state.system == 7
+    assert abs(SystemClock().now_ns() - state.t_ns) < 5e9
+
+
+def test_every_measurement_has_its_stream() -> None:
+    assert set(get_args(Measurement)) <= STREAM_OF.keys()

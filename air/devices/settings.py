@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from air.sensors.camera import StampPoint
 from common.config import Range
@@ -34,9 +34,10 @@ class PortConfig:
 
 @dataclass(frozen=True)
 class GnssConfig(PortConfig):
-    """The GNSS receiver (u-blox, UBX)."""
+    """The GNSS receiver (u-blox, UBX); `connector` is which of its own ports is used."""
 
     baud: Annotated[int, BAUD] = 460_800
+    connector: Literal["usb", "uart1", "uart2"] = "usb"
     table: ClassVar[str] = "devices.gnss"
 
 

@@ -143,8 +143,9 @@ def _ports(devices: DevicesConfig) -> Iterator[tuple[Driver, PortConfig]]:
     # Imported when needed: a driver brings its protocol's library along.
     if devices.gnss.port:
         from air.sensors.gnss_ublox import UbloxReceiver
+        from air.sensors.ublox_settings import Port as Connector
 
-        yield UbloxReceiver(), devices.gnss
+        yield UbloxReceiver(port=Connector(devices.gnss.connector)), devices.gnss
     if devices.imu.port:
         from air.sensors.imu_xsens import XsensImu
 
