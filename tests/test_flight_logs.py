@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import shutil
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from log_samples import FORMATS, UTC_S, write_log, write_ulog
 from PIL import Image
 from pymavlink import DFReader, mavutil
 from pyulog import ULog
@@ -48,56 +48,6 @@ def test_what_is_no_attitude_is_none(q: list[float]) -> None:
 
 
 # DataFlash
-
-FORMATS = {
-    "IMU": (10, "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
-    "GPS": (11, "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
-    "GPA": (12, "QBCCCCfBIHf", "TimeUS,I,VDop,HAcc,VAcc,SAcc,YAcc,VV,SMS,Delta,Und"),
-    "ATT": (13, "QccccCCCCB", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw,ErrRP,ErrYaw,AEKF"),
-    "POS": (14, "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
-    "BAT": (15, "QBfffffcfBB", "TimeUS,Inst,Volt,VoltR,Curr,CurrTot,EnrgTot,Temp,Res,RemPct,H"),
-    "MSG": (16, "QZ", "TimeUS,Message"),
-    "ARM": (17, "QBIBB", "TimeUS,ArmState,ArmChecks,Forced,Method"),
-    "NTUN": (18, "QfIB", "TimeUS,Dist,TBrg,Odd"),
-}
-PACKED = {"Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i"}
-
-
-def layout(name: str) -> struct.Struct:
-    return struct.Struct("<" + "".join(PACKED.get(letter, letter) for letter in FORMATS[name][1]))
-
-
-def message(name: str, *values: Any) -> bytes:
-    return b"\xa3\x95" + bytes([FORMATS[name][0]]) + layout(name).pack(*values)
-
-
-def describe(name: str) -> bytes:
-    number, letters, columns = FORMATS[name]
-    body = struct.pack("<BB4s16s64s", number, layout(name).size + 3, name.encode(), letters.encode(), columns.encode())
-    return b"\xa3\x95\x80" + body
-
-
-def write_log(gps: bool = True) -> bytes:
-    """Two seconds: two IMUs at 100 Hz, attitude at 10 Hz, GPS at 5 Hz that is logged 0.1 s late."""
-    fmt = struct.pack("<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
-    out = [b"\xa3\x95\x80" + fmt, *map(describe, FORMATS)]
-    out.append(message("ARM", 900_000, 1, 0, 0, 0))
-    out.append(message("MSG", 900_000, b"Plane V4.5"))
-    for i in range(200):
-        t_us = 1_000_000 + 10_000 * i
-        for k in range(2):
-            out.append(message("IMU", t_us, k, 0.1, 0.2, 0.3, 1.0, 2.0, -9.81 - k, 0, 0, 40.0, 1, 1, 100, 100))
-        if i % 10 == 0:
-            out.append(message("POS", t_us, 475_000_000, 85_000_000, 500.0, 40.0, 40.0))
-            out.append(message("BAT", t_us, 0, 15.2, 15.2, 9.5, 1.0, 1.0, 2500, 0.1, 65, 1))
-            out.append(message("ATT", t_us, 0, 0, 0, 3000, 0, 9000, 0, 0, 1))
-        if gps and i % 20 == 0:
-            ms = 216_000_000 + 10 * i - 100
-            out.append(message("GPA", t_us, 0, 120, 40, 70, 5, 0.0, 1, 0, 0, 0.0))
-            fix = (0, 3, ms, 2122, 17, 90, 475_000_000, 85_000_000, 54_700, 5.0, 90.0, -1.0, 0.0, 1)
-            out.append(message("GPS", t_us, *fix))
-        out.append(message("NTUN", t_us, 1.0, 2, 3))
-    return b"".join(out)
 
 
 @pytest.fixture
@@ -198,6 +148,21 @@ def test_damaged_logs_are_read_and_say_what_is_lost(tmp_path: Path) -> None:
 
 
 # ULog
+
+
+def test_a_px4_log_is_put_on_gnss_time(tmp_path: Path) -> None:
+    (tmp_path / "f.ulg").write_bytes(write_ulog())
+    source = open_source(f"ulog:{tmp_path / 'f.ulg'}")
+    items = list(source)
+    assert source.problems == ()
+    assert [len(of(items, kind)) for kind in (ImuSample, ReceiverSolution, VehicleState)] == [200, 10, 100]
+    stamps = [item.t_ns for item in items]
+    assert stamps == sorted(stamps)
+    assert stamps[0] == (UTC_S + 18 - 1) * 10**9
+    sample, fix, state = (of(items, kind)[0] for kind in (ImuSample, ReceiverSolution, VehicleState))
+    np.testing.assert_allclose([sample.accel, sample.gyro], [[1, -2, 9.81], [0.1, -0.2, -0.3]], rtol=1e-6)
+    assert (fix.kind, fix.latitude_deg, fix.height) == (FixKind.FIX_3D, 47.5, 547.0)
+    np.testing.assert_allclose(quaternion_to_matrix(state.q_enu_body)[:, 0], [0.0, 1.0, 0.0], atol=1e-12)  # north
 
 
 def test_the_px4_log_equals_what_pyulog_reads(real_data: Callable[[str], Path]) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import gpmf_bytes as gpmf
+import gpmf_samples as gpmf
 import numpy as np
 import pytest
 from hypothesis import given

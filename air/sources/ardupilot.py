@@ -6,7 +6,7 @@ Source: ArduPilot, "Onboard message log messages" (IMU, GPS, GPA, ATT, POS, BAT,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -55,7 +55,7 @@ def _read(path: Path, faults: Faults) -> Iterator[Sensed]:
     boot_ns = boot_time(messages(path, frozenset(("GPS",)), Faults()))
     if boot_ns is None:
         faults.add(path.name, "has no GNSS time; stamps count from the autopilot's start")
-    return reordered(_sensed(messages(path, WANTED, faults), boot_ns or 0))
+    return reordered(sensed(messages(path, WANTED, faults), boot_ns or 0))
 
 
 def messages(path: Path, wanted: frozenset[str], faults: Faults) -> Iterator[LogMessage]:
@@ -75,7 +75,7 @@ def messages(path: Path, wanted: frozenset[str], faults: Faults) -> Iterator[Log
         faults.add(path.name, f"{counts.refused} formats contradict themselves")
 
 
-def boot_time(gps: Iterator[LogMessage]) -> int | None:
+def boot_time(gps: Iterable[LogMessage]) -> int | None:
     """GPST of the autopilot's start, ns, or None where no GPS tells."""
     starts_ns = []
     for message in gps:
@@ -85,7 +85,8 @@ def boot_time(gps: Iterator[LogMessage]) -> int | None:
     return int(np.median(starts_ns)) if starts_ns else None
 
 
-def _sensed(log: Iterator[LogMessage], boot_ns: int) -> Iterator[Sensed]:
+def sensed(log: Iterable[LogMessage], boot_ns: int) -> Iterator[Sensed]:
+    """What the messages of a log tell, in their order; `boot_ns` is the GPST of the autopilot's start."""
     vehicle = _Vehicle(boot_ns)
     for message in log:
         time_us = message.values.get("TimeUS")

@@ -13,9 +13,11 @@ names the topics to read:
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any
 
 from rosbags.highlevel import AnyReader
@@ -33,6 +35,8 @@ from common.measurements import CameraFrame, Measurement
 CONVERTERS = {**ros.CONVERTERS, **gnss_comm.CONVERTERS}
 UNIMPORTANT = ("image", "raw", "color", "compressed", "data", "fix")
 """Parts of a topic's name that do not tell one device from another."""
+
+_LARGE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,25 @@ def open_bag(url: str, rest: str) -> Imported:
     return Imported(url, read, calibrations)
 
 
+class _BoundedFile(io.BufferedReader):
+    """A file that takes no memory for more bytes than it has, whatever length a damaged bag claims."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is not None and size > _LARGE:
+            size = min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0))
+        return super().read(size)
+
+
+class _BoundedPath(PosixPath):
+    """A path whose files are read in this way."""
+
+    def open(self, *_: Any, **__: Any) -> io.BufferedReader:  # type: ignore[override]
+        return _BoundedFile(io.FileIO(self))
+
+
 def _reader(path: Path) -> AnyReader:
-    return AnyReader([path], default_typestore=typestore())
+    # A folder (ROS 2) is read by SQLite or MCAP, and its YAML as text.
+    return AnyReader([path if path.is_dir() else _BoundedPath(path)], default_typestore=typestore())
 
 
 def typestore() -> Typestore:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,6 +30,7 @@ _NUMBERS = {
     "q": ">i4",
     "Q": ">i8",
 }
+_TEXT = "cFU"
 _FIXED_POINT = {"q": 2.0**-16, "Q": 2.0**-32}
 _LONGEST_TYPE = 64
 """Columns of one sample: cameras write at most some thirty."""
@@ -99,43 +100,31 @@ def read_items(data: bytes, damage: Damage) -> Iterator[Item]:
     damage.dropped_bytes += len(data[at:].rstrip(b"\0"))
 
 
-@dataclass
-class _Stream:
-    """What is known of a stream before its samples, which come last."""
-
-    texts: dict[str, str] = field(default_factory=dict)
-    numbers: dict[str, F64] = field(default_factory=dict)
-    last: Item | None = None
-
-
 def _read_stream(device: str, data: bytes, damage: Damage) -> Series | None:
-    stream = _Stream()
-    for item in read_items(data, damage):
-        stream.last = item
-        if chr(item.type) in "cFU":
-            stream.texts[item.key] = _text(item)
-        elif chr(item.type) in _NUMBERS and item.key != "SCAL":
-            stream.numbers[item.key] = _table(item, chr(item.type) * _columns(item)).ravel()
-        elif item.key == "SCAL":
-            stream.numbers["SCAL"] = _table(item, chr(item.type)).ravel()
-    if stream.last is None or stream.last.type == _NESTED or stream.last.key in stream.texts:
+    """The series of a stream: what describes it, and last its samples; None where it has none."""
+    items = list(read_items(data, damage))
+    if not items or items[-1].type == _NESTED or chr(items[-1].type) in _TEXT:
         return None
-    values = _samples(stream)
+    *described, samples = items
+    texts = {item.key: _text(item) for item in described if chr(item.type) in _TEXT}
+    numbers = {
+        item.key: _table(item, chr(item.type) * _columns(item)).ravel()
+        for item in described
+        if chr(item.type) in _NUMBERS
+    }
+    values = _samples(samples, texts.get("TYPE", ""), numbers.get("SCAL", np.ones(1)))
     if values is None:
         damage.refused += 1
         return None
-    return Series(device, stream.last.key, values, stream.texts, stream.numbers)
+    return Series(device, samples.key, values, texts, numbers)
 
 
-def _samples(stream: _Stream) -> F64 | None:
-    """The samples (N, M) of a stream, divided by its scale; None where type, size and scale do not fit together."""
-    item = stream.last
-    assert item is not None
-    types = _expand(stream.texts.get("TYPE", "")) if item.type == _COMPLEX else chr(item.type) * _columns(item)
+def _samples(item: Item, complex_type: str, scale: F64) -> F64 | None:
+    """The samples (N, M) of an item, divided by their scale; None where type, size and scale do not fit together."""
+    types = _expand(complex_type) if item.type == _COMPLEX else chr(item.type) * _columns(item)
     if not types or sum(np.dtype(_NUMBERS[t]).itemsize for t in types) != item.size:
         return None
     values = _table(item, types)
-    scale = stream.numbers.get("SCAL", np.ones(1))
     if len(scale) not in (1, values.shape[1]) or not np.all(scale):
         return None
     with np.errstate(all="ignore"):

@@ -14,12 +14,13 @@ R_FLU_FRD = np.diag([1.0, -1.0, -1.0])
 
 def enu(v_ned: npt.ArrayLike) -> F64:
     """Vectors (..., 3) in ENU of vectors in NED."""
-    return np.asarray(np.asarray(v_ned, float) @ R_ENU_NED.T)
+    v = np.asarray(v_ned, float)
+    return np.stack([v[..., 1], v[..., 0], -v[..., 2]], axis=-1)
 
 
 def flu(v_frd: npt.ArrayLike) -> F64:
     """Vectors (..., 3) in forward-left-up of vectors in forward-right-down."""
-    return np.asarray(np.asarray(v_frd, float) @ R_FLU_FRD.T)
+    return np.asarray(np.asarray(v_frd, float) * [1.0, -1.0, -1.0])
 
 
 def attitude(q_ned_frd: npt.ArrayLike) -> F64 | None:

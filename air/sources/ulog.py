@@ -193,4 +193,5 @@ def _vectors(table: Table | None, name: str) -> F64 | None:
 
 def _column(table: Table, name: str) -> F64:
     """A column as floats; NaN where the log's version of the message has none."""
-    return np.asarray(table.get(name, np.full(len(table["timestamp"]), np.nan)), np.float64)
+    with np.errstate(all="ignore"):  # damaged floats are any bit pattern
+        return np.asarray(table.get(name, np.full(len(table["timestamp"]), np.nan)), np.float64)
