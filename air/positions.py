@@ -14,6 +14,7 @@ from air.gnss.ephemerides import Ephemerides
 from air.gnss.positioning import PointPosition, Refused, find_position
 from air.gnss.settings import PositioningSettings
 from air.sources.source import Sensed
+from common.arrays import F64
 from common.errors import ExportError
 from common.geo import T_ecef_enu, ecef_to_geodetic
 from common.measurements import GnssEpoch
@@ -31,7 +32,7 @@ Outcome = PointPosition | Refused
 def find_positions(items: Iterable[Sensed], settings: PositioningSettings) -> Iterator[tuple[GnssEpoch, Outcome]]:
     """Each epoch with its position, from what was broadcast until then."""
     broadcast = Ephemerides()
-    last: dict[str, np.typing.NDArray[np.float64]] = {}
+    last: dict[str, F64] = {}
     for item in items:
         broadcast.add(item)
         if isinstance(item, GnssEpoch):

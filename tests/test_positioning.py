@@ -16,12 +16,12 @@ from scipy.stats import chi2
 from air.gnss.atmosphere import TYPICAL, klobuchar, saastamoinen
 from air.gnss.ephemerides import Ephemerides
 from air.gnss.gnss_time import SECOND_NS, from_week
+from air.gnss.least_squares import chi_square_limit
 from air.gnss.orbit import EARTH_RATE, geometric_range, states_at
 from air.gnss.positioning import (
     PointPosition,
     Refused,
     azimuth_elevation,
-    chi_square_limit,
     find_position,
 )
 from air.gnss.ranges import group_delay

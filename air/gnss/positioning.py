@@ -3,7 +3,7 @@
 Weighted least squares, iterated from the centre of the earth, with one receiver clock for each satellite system.
 Ranges that contradict the others are excluded one by one, the worst first; an epoch that then still contradicts
 itself, or that has too few ranges to notice, is refused. Sources: Misra and Enge, Global Positioning System, 6.1;
-error model of RTKLIB 2.4.3, manual E.6; test of residuals: Teunissen and Kleusberg, GPS for Geodesy, 7 (w-test).
+error model of RTKLIB 2.4.3, manual E.6.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ import numpy as np
 
 from air.gnss.atmosphere import L1_HZ, TYPICAL, klobuchar, saastamoinen
 from air.gnss.ephemerides import Ephemerides
-from air.gnss.orbit import EARTH_RATE, geometric_range
+from air.gnss.least_squares import chi_square_limit, cofactor_of, worst_residual
+from air.gnss.orbit import geometric_range
 from air.gnss.ranges import Ranges, clean_ranges
 from air.gnss.settings import PositioningSettings
 from air.gnss.signals import LIGHT
+from air.gnss.velocity import PointVelocity, find_velocity
 from common.arrays import F64, Bool
 from common.geo import ecef_to_geodetic
 from common.measurements import GnssEpoch, Ionosphere
@@ -28,8 +30,6 @@ COARSE_STEP = 1000.0
 CONVERGED_STEP = 1e-4
 _GLONASS_FACTOR = 1.5
 _SIGMA_CODE, _SIGMA_BIAS = 0.3, 0.3
-_NORMAL_QUANTILE = 3.0902
-"""That good residuals exceed once in a thousand times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +79,14 @@ def find_position(
     `near` (3,) m, ECEF, saves a few iterations; where it leads nowhere the search starts from nothing.
     """
     ranges = clean_ranges(epoch, broadcast, settings)
-    ionosphere = broadcast.ionosphere() or TYPICAL
-    fit = _fit(ranges, epoch.t_ns, ionosphere, settings, near)
+    errors = _Errors(ranges, epoch.t_ns, broadcast.ionosphere() or TYPICAL, settings)
+    fit = _fit(errors, near)
     if isinstance(fit, str) and near is not None:
-        fit = _fit(ranges, epoch.t_ns, ionosphere, settings, None)
+        fit = _fit(errors, None)
     if isinstance(fit, str):
         return Refused(epoch.t_ns, fit, ranges.rejected)
-    rejected = ranges.rejected | fit.rejected
-    velocity = _fit_velocity(ranges, fit, settings)
+    velocity = find_velocity(ranges, fit.used, fit.position, settings)
+    rejected = ranges.rejected | _rejected(ranges, fit)
     reason = _doubts(fit, velocity, settings)
     if reason:
         return Refused(epoch.t_ns, reason, rejected)
@@ -113,7 +113,11 @@ def find_position(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A converged position; arrays have a row for each range, those not used included."""
+    """A converged position; arrays have a row for each range, those not used included.
+
+    `worst` is the range that contradicts the others most, None where others cannot tell; `excluded` maps those that
+    were left out to their residuals, m.
+    """
 
     position: F64
     clocks: dict[str, float]
@@ -122,34 +126,53 @@ class _Fit:
     residuals: F64
     azimuth: F64
     elevation: F64
-    rejected: dict[str, str]
     pdop: float
     chi_square: float
     redundancy: int
-    excluded: int
+    worst: int | None
+    excluded: dict[int, float]
 
 
-def _fit(
-    ranges: Ranges, t_ns: int, ionosphere: Ionosphere, settings: PositioningSettings, near: F64 | None
-) -> _Fit | str:
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """What is needed to model the errors of ranges."""
+
+    ranges: Ranges
+    t_ns: int
+    ionosphere: Ionosphere
+    settings: PositioningSettings
+
+
+def _fit(errors: _Errors, near: F64 | None) -> _Fit | str:
     """The position that fits best after outliers were excluded, or why there is none."""
-    excluded: dict[int, str] = {}
+    fit = _converge(errors, near, {})
+    while isinstance(fit, _Fit) and _contradictory(fit) and errors.settings.exclude_outliers:
+        # One range more must stay for each that goes: those that agree shall outnumber those that do not.
+        enough = fit.redundancy - 1 >= errors.settings.min_redundancy + len(fit.excluded) + 1
+        if fit.worst is None or not enough:
+            break
+        fit = _converge(errors, fit.position, fit.excluded | {fit.worst: float(fit.residuals[fit.worst])})
+    return fit
+
+
+def _converge(errors: _Errors, near: F64 | None, excluded: dict[int, float]) -> _Fit | str:
+    """The weighted least squares position without some of the ranges, or why there is none."""
+    ranges = errors.ranges
+    allowed = ~np.isin(np.arange(len(ranges.satellites)), list(excluded))
     clocks: dict[str, float] = {}
-    position = np.zeros(3) if near is None else near
-    coarse = near is None
-    for _ in range(MAX_ITERATIONS + len(ranges.satellites)):
-        model = _coarse_model(ranges, position) if coarse else _model(ranges, position, t_ns, ionosphere, settings)
-        used = model.above & ~np.isin(np.arange(len(ranges.satellites)), list(excluded))
+    position, coarse = (np.zeros(3), True) if near is None else (near, False)
+    for _ in range(MAX_ITERATIONS):
+        model = _coarse_model(ranges, position) if coarse else _model(errors, position)
+        used = model.above & allowed
         groups = sorted({name for name, use in zip(ranges.clock, used, strict=True) if use})
         redundancy = int(used.sum()) - 3 - len(groups)
         if redundancy < 0:
             return f"too few ranges: {used.sum()} for {3 + len(groups)} unknowns"
         H = np.column_stack([-model.line[used], *(_belongs(ranges.clock, used, name) for name in groups)])
-        bias = np.array([clocks.get(name, 0.0) for name in ranges.clock])
-        v = (ranges.pseudorange - model.expected - bias)[used]
+        v = (ranges.pseudorange - model.expected - _bias(ranges, clocks))[used]
         sigma = model.sigma[used]
         try:
-            cofactor = _cofactor(H, sigma)
+            cofactor = cofactor_of(H, sigma)
             step = cofactor @ (H.T @ (v / sigma**2))
         except np.linalg.LinAlgError:
             return "ranges do not determine a position"
@@ -158,45 +181,52 @@ def _fit(
         length = float(np.linalg.norm(step))
         if not length < 1e9:
             return "the solution diverges"
-        if coarse or length >= CONVERGED_STEP:
-            coarse = coarse and length > COARSE_STEP
-            continue
+        if not coarse and length < CONVERGED_STEP:
+            break
+        coarse = coarse and length > COARSE_STEP
+    else:
+        return "the solution does not converge"
 
-        v = v - H @ step
-        chi_square = float(v / sigma @ (v / sigma))
-        if redundancy > 0 and chi_square > chi_square_limit(redundancy) and settings.exclude_outliers:
-            worst = _worst(v, sigma, H, cofactor)
-            if worst is not None and redundancy - 1 >= settings.min_redundancy + len(excluded) + 1:
-                excluded[int(np.flatnonzero(used)[worst])] = f"residual of {v[worst]:.0f} m"
-                continue
-        return _Fit(
-            position=position,
-            clocks=clocks,
-            covariance=cofactor[:3, :3],
-            used=used,
-            residuals=ranges.pseudorange - model.expected - np.array([clocks.get(c, np.nan) for c in ranges.clock]),
-            azimuth=model.azimuth,
-            elevation=model.elevation,
-            rejected={
-                satellite: excluded.get(i, "below the elevation mask")
-                for i, satellite in enumerate(ranges.satellites)
-                if not used[i]
-            },
-            pdop=float(np.sqrt(np.trace(np.linalg.inv(H.T @ H)[:3, :3]))),
-            chi_square=chi_square,
-            redundancy=redundancy,
-            excluded=len(excluded),
-        )
-    return "the solution does not converge"
+    v = v - H @ step
+    worst = worst_residual(v, sigma, H, cofactor)
+    return _Fit(
+        position=position,
+        clocks=clocks,
+        covariance=cofactor[:3, :3],
+        used=used,
+        residuals=ranges.pseudorange - model.expected - _bias(ranges, clocks),
+        azimuth=model.azimuth,
+        elevation=model.elevation,
+        pdop=float(np.sqrt(np.trace(cofactor_of(H, np.ones(len(H)))[:3, :3]))),
+        chi_square=float(v / sigma @ (v / sigma)),
+        redundancy=redundancy,
+        worst=None if worst is None else int(np.flatnonzero(used)[worst]),
+        excluded=excluded,
+    )
 
 
-def _doubts(fit: _Fit, velocity: _Velocity, settings: PositioningSettings) -> str:
+def _contradictory(fit: _Fit) -> bool:
+    return fit.redundancy > 0 and fit.chi_square > chi_square_limit(fit.redundancy)
+
+
+def _rejected(ranges: Ranges, fit: _Fit) -> dict[str, str]:
+    """Why ranges were not used, by satellite."""
+    reasons = {i: f"residual of {residual:.0f} m" for i, residual in fit.excluded.items()}
+    names = enumerate(ranges.satellites)
+    return {name: reasons.get(i, "below the elevation mask") for i, name in names if not fit.used[i]}
+
+
+def _bias(ranges: Ranges, clocks: dict[str, float]) -> F64:
+    return np.array([clocks.get(name, 0.0) for name in ranges.clock])
+
+
+def _doubts(fit: _Fit, velocity: PointVelocity, settings: PositioningSettings) -> str:
     """Why a converged position is not to be believed, empty when it is."""
     height = float(ecef_to_geodetic(fit.position)[2])
     speed = float(np.linalg.norm(velocity.velocity))
-    if fit.redundancy < settings.min_redundancy + fit.excluded:
-        return f"nothing to check it with: redundancy {fit.redundancy}, {fit.excluded} ranges excluded"
-    if fit.redundancy > 0 and fit.chi_square > chi_square_limit(fit.redundancy):
+    if fit.redundancy < settings.min_redundancy + len(fit.excluded):
+        return f"nothing to check it with: redundancy {fit.redundancy}, {len(fit.excluded)} ranges excluded"
+    if _contradictory(fit):
         return f"ranges contradict each other: χ² {fit.chi_square:.0f} of {fit.redundancy} degrees of freedom"
     if not fit.pdop <= settings.max_pdop:
         return f"poor geometry: PDOP {fit.pdop:.0f}"
@@ -205,12 +235,6 @@ def _doubts(fit: _Fit, velocity: _Velocity, settings: PositioningSettings) -> st
     if speed > settings.max_speed:
         return f"impossible speed: {speed:.0f} m/s"
     return ""
-
-
-def chi_square_limit(degrees: int) -> float:
-    """What χ² exceeds once in a thousand times; within 3 % (Wilson and Hilferty, 1931)."""
-    spread = 2.0 / (9.0 * degrees)
-    return float(degrees * (1.0 - spread + _NORMAL_QUANTILE * np.sqrt(spread)) ** 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +256,8 @@ def _coarse_model(ranges: Ranges, position: F64) -> _Model:
     return _Model(expected, line, np.zeros(n), np.zeros(n), np.ones(n), np.ones(n, bool))
 
 
-def _model(ranges: Ranges, position: F64, t_ns: int, ionosphere: Ionosphere, settings: PositioningSettings) -> _Model:
+def _model(errors: _Errors, position: F64) -> _Model:
+    ranges, settings = errors.ranges, errors.settings
     distance, line = geometric_range(ranges.states.position, position)
     geodetic = ecef_to_geodetic(position) * (np.pi / 180, np.pi / 180, 1.0)
     azimuth, elevation = azimuth_elevation(line, geodetic)
@@ -246,7 +271,9 @@ def _model(ranges: Ranges, position: F64, t_ns: int, ionosphere: Ionosphere, set
         delay_i, sigma_i, code = np.zeros_like(distance), np.zeros_like(distance), 3 * code
     else:
         scale = (L1_HZ / ranges.frequency) ** 2
-        delay_i, sigma_i = (scale * value for value in klobuchar(ionosphere, t_ns, geodetic, azimuth, angle))
+        delay_i, sigma_i = (
+            scale * value for value in klobuchar(errors.ionosphere, errors.t_ns, geodetic, azimuth, angle)
+        )
     sigma = np.sqrt(code**2 + _SIGMA_BIAS**2 + ranges.sigma**2 + sigma_i**2 + sigma_t**2)
     return _Model(distance - LIGHT * ranges.states.clock + delay_i + delay_t, line, azimuth, elevation, sigma, above)
 
@@ -262,57 +289,3 @@ def azimuth_elevation(line: F64, geodetic: F64) -> tuple[F64, F64]:
 
 def _belongs(clocks: tuple[str, ...], used: Bool, name: str) -> F64:
     return np.array([clock == name for clock, use in zip(clocks, used, strict=True) if use], float)
-
-
-def _cofactor(H: F64, sigma: F64) -> F64:
-    """Covariance of the unknowns. Raises LinAlgError where the rows do not determine them."""
-    return np.asarray(np.linalg.inv(H.T @ (H / sigma[:, None] ** 2)), np.float64)
-
-
-def _worst(v: F64, sigma: F64, H: F64, cofactor: F64) -> int | None:
-    """Index of the residual whose removal lowers χ² most (w-test), None where none can be checked by others."""
-    left = sigma**2 - np.einsum("ij,jk,ik->i", H, cofactor, H)
-    checked = left > 1e-6 * sigma**2
-    if not checked.any():
-        return None
-    return int(np.argmax(np.where(checked, v**2 / np.where(checked, left, 1.0), -1.0)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Velocity:
-    velocity: F64
-    covariance: F64
-    drift: float
-    used: Bool
-
-
-def _fit_velocity(ranges: Ranges, fit: _Fit, settings: PositioningSettings) -> _Velocity:
-    """Velocity m/s and clock drift m/s from range rates, after outliers were excluded; NaN where that fails."""
-    used = fit.used & np.isfinite(ranges.range_rate)
-    p_sat, v_sat = ranges.states.position, ranges.states.velocity
-    _, line = geometric_range(p_sat, fit.position)
-    turn = EARTH_RATE / LIGHT
-    # Range rate is linear in the receiver's velocity; the last two terms are the Sagnac effect's.
-    sagnac = turn * (v_sat[:, 1] * fit.position[0] - v_sat[:, 0] * fit.position[1])
-    still = np.einsum("ij,ij->i", v_sat, line) + sagnac - LIGHT * ranges.states.drift
-    H_all = np.column_stack([-line, np.ones(len(line))])
-    H_all[:, 0] += turn * p_sat[:, 1]
-    H_all[:, 1] -= turn * p_sat[:, 0]
-    excluded = 0
-    sigma_all = np.fmax(ranges.sigma_rate, settings.sigma_doppler)
-    while (redundancy := int(used.sum()) - 4) >= settings.min_redundancy + excluded:
-        H, y, sigma = H_all[used], (ranges.range_rate - still)[used], sigma_all[used]
-        try:
-            cofactor = _cofactor(H, sigma)
-        except np.linalg.LinAlgError:
-            break
-        x = cofactor @ (H.T @ (y / sigma**2))
-        v = y - H @ x
-        if v / sigma @ (v / sigma) <= chi_square_limit(max(redundancy, 1)):
-            return _Velocity(x[:3], cofactor[:3, :3], float(x[3]), used)
-        worst = _worst(v, sigma, H, cofactor)
-        if worst is None:
-            break
-        used[np.flatnonzero(used)[worst]] = False
-        excluded += 1
-    return _Velocity(np.full(3, np.nan), np.full((3, 3), np.nan), np.nan, np.zeros_like(used))

@@ -16,6 +16,7 @@ import numpy as np
 from air.gnss.calendar import from_calendar
 from air.gnss.gnss_time import BDT_MINUS_GPST_NS, SECOND_NS
 from air.gnss.rinex_lines import Lines, number
+from common.arrays import F64, U8
 from common.measurements import GnssEpoch
 
 _SATELLITE = re.compile(r"[GRECJSI]\d\d")
@@ -235,10 +236,10 @@ MAX_GAP_NS = 60 * SECOND_NS
 def _lock_times(
     t_ns: int,
     keys: list[tuple[str, str]],
-    loss: np.typing.NDArray[np.uint8],
-    phase: np.typing.NDArray[np.float64],
+    loss: U8,
+    phase: F64,
     locks: dict[tuple[str, str], tuple[int, int]],
-) -> np.typing.NDArray[np.float64]:
+) -> F64:
     """Seconds (N,) since the last loss of lock that the file tells of, NaN without a phase."""
     times = np.full(len(keys), np.nan)
     for i, key in enumerate(keys):
