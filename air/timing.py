@@ -38,9 +38,10 @@ _EARLY_S = 0.3e-3
 """An arrival that is earlier than a locked clock allows, by at least this, is suspected."""
 _IMPOSSIBLE_S = 1.0
 _OUTLIER_S = 0.05
-_SUSPECTS, _SUSPECTS_S = 3, 2.0
+_SUSPECTS, _SUSPECTS_S = 3, 5.0
 """So many suspects within so short a time are a clock that stepped."""
 _STEPPED_BUCKETS, _USUAL_BUCKETS = 6, 20
+_LEAST_SIGMA_S = 1e-6
 _WANDER_PER_S = 1e-8
 """How fast a drift changes, at worst, with the temperature."""
 _SUPPORTED = 0.6
@@ -150,7 +151,12 @@ class ClockFilter:
         point = (t, (host_ns - self._origin_ns[1]) * 1e-9 - t)
         self._arrived += 1
         self._newest = t if self._newest is None else max(t, self._newest)
-        if self._buckets and t // BUCKET_S <= self._buckets[-1][0] // BUCKET_S:
+        bucket = self._buckets[-1][0] // BUCKET_S if self._buckets else -math.inf
+        if t // BUCKET_S < bucket:
+            if not self.locked:  # a device that was set up began to count anew
+                self._restart(device_ns, host_ns)
+            return
+        if t // BUCKET_S == bucket:
             if self._height(point) < self._height(self._buckets[-1]):
                 self._buckets[-1] = point
             if delay < 0:
@@ -175,7 +181,7 @@ class ClockFilter:
         self._offset = min(y - self.drift * t for t, y in self._buckets)
         heights = sorted(map(self._height, self._buckets))
         rank = min(_RANK, len(heights) - 1)
-        self._spread = _EXCESS * heights[rank] / rank if rank else _IMPOSSIBLE_S
+        self._spread = max(_LEAST_SIGMA_S, _EXCESS * heights[rank] / rank) if rank else _IMPOSSIBLE_S
 
     def _stepped(self) -> bool:
         """Whether the earliest arrivals of the latest buckets all came later than nine of ten did before them."""

@@ -73,6 +73,15 @@ def test_a_late_step_is_told_from_late_arrivals() -> None:
     assert clock.host_ns(46_000_000_000) - HOST_NS == pytest.approx(46_200_000_000, abs=100_000)
 
 
+def test_a_device_that_begins_to_count_anew_while_it_is_set_up_is_followed() -> None:
+    clock = ClockFilter()
+    for i in range(50):
+        clock.observe(int(1e15) + i * 10_000_000, HOST_NS + i * 10_000_000)
+    observed(clock, 5)
+    assert clock.resets == 1
+    assert clock.host_ns(4_000_000_000) - HOST_NS == pytest.approx(4_000_000_000, abs=1000)
+
+
 def test_single_impossible_arrivals_are_refused_and_change_nothing() -> None:
     clock = ClockFilter()
     observed(clock, 30)
