@@ -250,6 +250,34 @@ def test_a_killed_recorder_loses_at_most_the_last_second(flying: Flying) -> None
     assert "ends without its index" in problems[0]
 
 
+def test_a_recorder_that_is_held_up_loses_nothing(flying: Flying) -> None:
+    """Half a second without the processor: more frames wait than shared memory holds."""
+    big = frame(0, 1280, 720)
+    sent: list[bytes] = []
+
+    def film() -> None:
+        begun_s = time.monotonic()
+        for i in range(60):
+            time.sleep(max(0.0, begun_s + i / 30 - time.monotonic()))
+            sent.append(encode(replace(big, index=i)))
+            flying.bus.publish(message_key("uav1", RAW_CAMERA, big), sent[-1], RAW_CAMERA)
+
+    filming = threading.Thread(target=film)
+    filming.start()
+    holding = threading.Timer(0.7, os.kill, (flying.program.process.pid, signal.SIGSTOP))
+    letting = threading.Timer(1.2, os.kill, (flying.program.process.pid, signal.SIGCONT))
+    holding.start()
+    letting.start()
+    samples = flying.publish(2.0)
+    filming.join()
+    wait_until(lambda: flying.health[-1].counts["messages"] >= len(samples) + len(sent))
+    flying.program.stop()
+    assert flying.recorded() == samples
+    key = message_key("uav1", RAW_CAMERA, big)
+    frames = [decode(CameraFrame, m.payload) for m in Recording(flying.path).messages() if m.key == key]
+    assert [f.index for f in frames] == list(range(60))
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_three_minutes_at_full_rate_drop_nothing(tmp_path: Path) -> None:
