@@ -22,7 +22,7 @@ _SMOOTHING_S = (1.0, 0.5)
 _BEFORE_S = 100.0
 _SHORTEST_S = 30.0
 """A flight with less time than this for its lines does not come home within it."""
-_FLARE = 3.0
+_FLARE = 4.0
 """Up to this height above the ground, m, the wind takes hold of the aircraft little by little."""
 
 
@@ -113,8 +113,14 @@ class Mission:
         for window in windows:
             rows = [np.convolve(row, np.full(window, 1 / window), "valid") for row in rows]
         east, north, up, heading, rotors = rows
-        share = np.clip(up / _FLARE, 0, 1)
-        return Reference(np.stack([east, north, up], axis=1), heading, share**2 * (3 - 2 * share), rotors)
+        airborne = _smooth_step(up / _FLARE)
+        return Reference(np.stack([east, north, up], axis=1), heading, airborne, rotors)
+
+
+def _smooth_step(x: F64) -> F64:
+    """0 up to 0, 1 from 1 on, twice continuously differentiable."""
+    s = np.clip(x, 0, 1)
+    return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
 
 
 def plan(options: FlightOptions, duration_s: float) -> Mission:
@@ -165,7 +171,7 @@ class _Route:
     def hover(self) -> None:
         """Hover until it is time to land; in a flight too short for that, all the time."""
         spare_s = self._duration_s - self._t[-1] - self._return_s(self._p[-1])
-        self.wait(spare_s if spare_s > 0 else self._duration_s, Phase.HOVER)
+        self.wait(spare_s if spare_s > 0 else self._duration_s + _BEFORE_S, Phase.HOVER)
         self._land()
 
     def survey(self, waypoints: Iterator[F64]) -> None:

@@ -1,7 +1,7 @@
 """DJI's telemetry as MAVLink: what the drone's own autopilot knows, as the bridge RosettaDrone sends it.
 
-The bridge's habits are kept: its ATTITUDE has no time, heights are relative to home and stand, in mm, also where the
-protocol wants m, currents are in mA where it wants 10 mA, and much is left at zero.
+The bridge's habits are kept: its ATTITUDE has no time, its heights are all relative to home, its currents are in mA
+where the protocol wants 10 mA, its home has the height to return at, in m, and much is left at zero.
 
 Source: RosettaDrone, DroneModel.java (rates and fields); the MAVLink message set common.
 """
@@ -44,7 +44,8 @@ _MODES = {
 _FIX_3D, _SATELLITES = 3, 17
 _ARMED_THRUST = 0.1
 _CELLS, _CAPACITY_MAH, _HOVER_MA, _IDLE_MA = 12, 11_870, 19_000, 1_500
-_FULL_MV, _FLAT_MV = 4_350, 3_500
+_FULL_MV, _FLAT_MV, _UNKNOWN_MV = 4_350, 3_500, 0xFFFF
+_RETURN_HEIGHT_M = 50
 
 
 @dataclass(frozen=True)
@@ -147,14 +148,14 @@ class SimulatedTelemetry:
 
     def _tick(self, tick: int, claim: _Claim) -> Iterator[bytes]:
         """The messages of one tick of the bridge."""
-        pack, height_mm = self._writer.pack, int(claim.height * 1000)
-        roll, pitch, yaw = claim.attitude
+        pack, (roll, pitch, yaw) = self._writer.pack, claim.attitude
         yield pack("ATTITUDE", roll=roll, pitch=pitch, yaw=yaw)
-        yield pack("ALTITUDE", altitude_relative=height_mm)
+        yield pack("ALTITUDE", altitude_relative=claim.height)
         yield pack("VIBRATION")
         yield self._hud(claim)
-        if tick % 3 == 0:
+        if tick % 2 == 0:
             yield self._position(claim)
+        if tick % 3 == 0:
             yield self._gps(claim)
             yield pack("RADIO_STATUS")
             yield pack("RC_CHANNELS", chancount=8, rssi=98)
@@ -163,7 +164,8 @@ class SimulatedTelemetry:
             yield from self._battery(claim)
         if tick % 50 == 0:
             latitude_deg, longitude_deg, _ = enu_to_geodetic(self._datum, self._home).tolist()
-            yield pack("HOME_POSITION", latitude=int(latitude_deg * 1e7), longitude=int(longitude_deg * 1e7))
+            latitude, longitude = int(latitude_deg * 1e7), int(longitude_deg * 1e7)
+            yield pack("HOME_POSITION", latitude=latitude, longitude=longitude, altitude=_RETURN_HEIGHT_M)
 
     def _heartbeat(self, claim: _Claim) -> bytes:
         guided = _GUIDED if claim.phase not in (Phase.STAND, Phase.HOVER) else 0
@@ -190,6 +192,7 @@ class SimulatedTelemetry:
             "GLOBAL_POSITION_INT",
             lat=int(claim.latitude_deg * 1e7),
             lon=int(claim.longitude_deg * 1e7),
+            alt=int(claim.height * 1000),
             relative_alt=int(claim.height * 1000),
             vx=vx,
             vy=vy,
@@ -209,12 +212,11 @@ class SimulatedTelemetry:
 
     def _battery(self, claim: _Claim) -> Iterator[bytes]:
         left = max(0.0, 1 - claim.used_mah / _CAPACITY_MAH)
-        cell_mv, percent = int(_FLAT_MV + (_FULL_MV - _FLAT_MV) * left), int(100 * left)
-        current = _int16(-claim.current_ma)
+        pack_mv, percent = int(_CELLS * (_FLAT_MV + (_FULL_MV - _FLAT_MV) * left)), int(100 * left)
         yield self._writer.pack(
             "SYS_STATUS",
-            voltage_battery=min(_CELLS * cell_mv, 0xFFFF),
-            current_battery=current,
+            voltage_battery=pack_mv,
+            current_battery=_int16(claim.current_ma),
             battery_remaining=percent,
         )
         yield self._writer.pack("POWER_STATUS")
@@ -222,8 +224,8 @@ class SimulatedTelemetry:
             "BATTERY_STATUS",
             current_consumed=int(claim.used_mah),
             temperature=3100,
-            voltages=[cell_mv] * 10,
-            current_battery=_int16(-10 * claim.current_ma),
+            voltages=[_UNKNOWN_MV] * 10,
+            current_battery=_int16(10 * claim.current_ma),
             battery_remaining=percent,
         )
 

@@ -41,14 +41,15 @@ def turbulence(rng: np.random.Generator, wind: float, height: float, airspeed: f
 
 
 def gusts(rng: np.random.Generator, size: float, step_s: float, count: int) -> F64:
-    """Gusts (N, 3) m/s of up to `size` in random directions: one minus cosine, about two a minute."""
+    """Gusts (N, 3) m/s of up to `size` in random directions, one after another: one minus cosine, two a minute."""
     t, total = np.arange(count) * step_s, np.zeros((count, 3))
     at = 0.0
     while (at := at + float(rng.exponential(GUST_EVERY_S))) < count * step_s:
         seconds, peak, azimuth = rng.uniform(*GUST_S), size * rng.uniform(0.4, 1.0), rng.uniform(0, 2 * np.pi)
         direction = np.array([np.cos(azimuth), np.sin(azimuth), rng.uniform(-0.3, 0.3)])
         during = (t > at) & (t < at + seconds)
-        total[during] += peak / 2 * (1 - np.cos(2 * np.pi * (t[during] - at) / seconds))[:, None] * direction
+        total[during] = peak / 2 * (1 - np.cos(2 * np.pi * (t[during] - at) / seconds))[:, None] * direction
+        at += seconds
     return total
 
 
