@@ -120,8 +120,9 @@ def test_a_layout_writes_what_it_reads(bits: int) -> None:
 # Collecting
 
 
-ALL = [*SOME.values(), GLONASS]
-each = pytest.mark.parametrize("eph", ALL, ids=[*SOME, "GLONASS"])
+UNPREDICTED = replace(SOME["LNAV"], accuracy=math.nan)
+ALL = [*SOME.values(), UNPREDICTED, GLONASS]
+each = pytest.mark.parametrize("eph", ALL, ids=[*SOME, "no accuracy", "GLONASS"])
 
 
 @each

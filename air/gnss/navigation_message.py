@@ -40,7 +40,7 @@ class NavigationMessages:
     def __init__(self) -> None:
         self.refused = 0
         self._sets: dict[str, _Set] = {}
-        self._latest: dict[tuple[str, str], Broadcast] = {}
+        self._latest: dict[tuple[str, str], str] = {}
 
     def add(
         self, satellite: str, signal: str, words: Sequence[int], channel: int, t_ns: int, leap_s: int
@@ -122,10 +122,10 @@ class NavigationMessages:
         """Whether anything but the time of its reception differs from what was last given."""
         name = message.system if isinstance(message, Ionosphere) else message.satellite
         key = (type(message).__name__, name)
-        before = self._latest.get(key)
-        if before is not None and replace(before, t_ns=message.t_ns) == message:
+        content = repr(replace(message, t_ns=0))  # as text, in which NaN equals itself
+        if self._latest.get(key) == content:
             return False
-        self._latest[key] = message
+        self._latest[key] = content
         return True
 
 
