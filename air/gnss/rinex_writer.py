@@ -44,8 +44,16 @@ def write_navigation(
         file.writelines(line + "\n" for line in lines)
 
 
-def write_observations(file: TextIO, epochs: Sequence[GnssEpoch], program: str = "luojia") -> None:
-    """Write epochs of one receiver in the order given; a phase after a loss of lock is marked."""
+def write_observations(
+    file: TextIO,
+    epochs: Sequence[GnssEpoch],
+    program: str = "luojia",
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> None:
+    """Write epochs of one receiver in the order given; a phase after a loss of lock is marked.
+
+    `position` m, ECEF, is where the antenna is, roughly or, of a base station, exactly.
+    """
     codes = _codes(epochs)
     channels = {
         satellite: channel
@@ -56,7 +64,7 @@ def write_observations(file: TextIO, epochs: Sequence[GnssEpoch], program: str =
     _header(file, "OBSERVATION DATA    M: MIXED", program)
     for label in ("MARKER NAME", "OBSERVER / AGENCY", "REC # / TYPE / VERS", "ANT # / TYPE"):
         _label(file, "", label)
-    _label(file, f"{0:14.4f}{0:14.4f}{0:14.4f}", "APPROX POSITION XYZ")
+    _label(file, "".join(f"{value:14.4f}" for value in position), "APPROX POSITION XYZ")
     _label(file, f"{0:14.4f}{0:14.4f}{0:14.4f}", "ANTENNA: DELTA H/E/N")
     for system, names in codes.items():
         for i in range(0, len(names), 13):

@@ -19,8 +19,8 @@ from air.gnss.ephemerides import is_healthy
 from air.gnss.gnss_time import BEIDOU_EPOCH_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
 from air.gnss.orbit import EARTH_RATE, is_geostationary, states_at
 from air.sources.rinex import open_rinex
-from air.sources.simulated.nominal_orbits import nominal
 from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.nominal_orbits import nominal
 from common.errors import SourceError
 from common.measurements import Ephemeris, GlonassEphemeris, Ionosphere, KeplerEphemeris
 
@@ -89,8 +89,8 @@ class Constellation:
         """The same orbit and clock, described for another reference time (geostationary: as it is)."""
         if isinstance(orbit, GlonassEphemeris):
             at = states_at([orbit], toe_ns, np.zeros(1))
-            position, velocity = (tuple(map(float, v[0])) for v in (at.position, at.velocity))
-            return replace(orbit, toe_ns=toe_ns, position=position, velocity=velocity, tau=float(at.clock[0]))
+            (x, y, z), (vx, vy, vz) = at.position[0].tolist(), at.velocity[0].tolist()
+            return replace(orbit, toe_ns=toe_ns, position=(x, y, z), velocity=(vx, vy, vz), tau=float(at.clock[0]))
         if is_geostationary(orbit.satellite):
             return orbit
         issue = number % 256 if orbit.satellite[0] == "G" else number % 1024

@@ -14,16 +14,15 @@ from air.sensors import ubx
 from air.sensors.ubx_messages import NAV_PVT, RXM_RAWX, RXM_SFRBX, pack_sfrbx
 from air.sensors.ubx_pvt import pack_pvt
 from air.sensors.ubx_rawx import pack_rawx, parse_rawx
+from air.sources.simulated.antenna import Antenna
 from air.sources.simulated.broadcast import Broadcast, Piece
 from air.sources.simulated.gnss_options import GnssOptions
-from air.sources.simulated.observables import TRACKING, Antenna, Blocked, Observables, Observer
+from air.sources.simulated.observables import TRACKING, Blocked, Observables, Observer
 from air.sources.simulated.own_solution import OwnSolution
 from air.sources.simulated.sky import Sky
 from air.sources.simulated.tracking import Tracked, Tracking
-from common.arrays import F64, Bool
-from common.geo import T_ecef_enu
+from common.arrays import F64
 from common.measurements import GnssEpoch
-from common.messages import Datum
 
 ROVER, BASE_STATION = 54, 61
 """First part numbers of the random streams of the two receivers."""
@@ -36,8 +35,11 @@ _SIGMA_FLOOR = 0.01, 0.004, 0.002
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """An epoch as the receiver tells it (`payload` of RXM-RAWX), and the truth: at `t_s` of the flight its clock was ahead by `clock` s and
-    gained `drift` s/s; of each row of the epoch `azimuth`, `elevation` rad, `multipath` m and `ambiguity` cycles."""
+    """An epoch as the receiver tells it, `payload` of RXM-RAWX, and the truth.
+
+    At `t_s` of the flight its clock was ahead by `clock` s and gained `drift` s/s. Of each row of the epoch (N,):
+    `azimuth`, `elevation` rad, `multipath` of the code m, `ambiguity` cycles.
+    """
 
     t_s: float
     epoch: GnssEpoch
@@ -63,16 +65,14 @@ class SimulatedReceiver:
         duration_s: float,
         part: int = ROVER,
         blocked: Blocked | None = None,
-        datum: Datum | None = None,
     ):
-        """`blocked` asks in the frame `world` of `datum`. Raises SourceError for impossible times in the options."""
+        """Raises SourceError for impossible times in the options."""
         self.device = device
         self.options = options
-        self._sky, self._antenna, self._seed, self._part, self._duration_s = sky, antenna, seed, part, duration_s
-        self._blocked, self._datum = blocked, datum
+        self._sky, self._seed, self._part, self._duration_s = sky, seed, part, duration_s
+        self._observer = Observer(sky, antenna, blocked, options, seed, part)
         self._names = np.array([[name, name] for name in sky.satellites], object)
         self._signals = np.array(sky.signals, object)
-        self._observer()
 
     def observations(self) -> Iterator[Observed]:
         """All epochs with their truth."""
@@ -129,20 +129,11 @@ class SimulatedReceiver:
     def _since_start(self, t_ns: int) -> float:
         return (t_ns - self._sky.start_ns) / SECOND_NS
 
-    def _observer(self) -> Observer:
-        def hidden(t_s: float, direction: F64) -> Bool:
-            position, _ = self._antenna(np.array([t_s]))
-            assert self._blocked is not None and self._datum is not None
-            return self._blocked(T_ecef_enu(self._datum).inverse().apply(position[0]), direction)
-
-        asked = hidden if self._blocked is not None else None
-        return Observer(self._sky, self._antenna, asked, self.options, self._seed, self._part)
-
     def _seconds(self) -> Iterator[tuple[int, Iterator[tuple[Observed, Tracked]]]]:
         rng = np.random.default_rng([self._seed, self._part + TRACKING])
         tracking = Tracking(self.options, len(self._sky.satellites), rng)
         clock = _Milliseconds()
-        for number, observables in self._observer().seconds(self._duration_s):
+        for number, observables in self._observer.seconds(self._duration_s):
             chances = np.random.default_rng([self._seed, self._part + TRACKING, number]).random(
                 (len(observables.t_s), 2, *self._names.shape)
             )

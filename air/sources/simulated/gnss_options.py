@@ -39,10 +39,10 @@ class GnssOptions:
     missing: Annotated[float, Range(0.0, 0.95)] = 0.25
     mask_deg: Annotated[float, Range(0.0, 60.0)] = 7.0
     cold: Switch = 0
-    orbit: Size = 0.5
-    satellite_clock: Size = 0.4
+    orbit: Size = 0.6
+    satellite_clock: Size = 0.5
     ionosphere: Size = 1.0
-    ionosphere_residual: Size = 0.8
+    ionosphere_residual: Size = 1.0
     troposphere: Size = 1.0
     troposphere_residual: Size = 0.1
     clock: Size = 1.0
@@ -51,7 +51,7 @@ class GnssOptions:
     code: Size = 0.3
     phase: Size = 0.0015
     doppler: Size = 0.03
-    multipath: Size = 2.0
+    multipath: Size = 3.5
     carrier_multipath: Size = 0.002
     multipath_s: Annotated[float, Range(1.0, 3600.0)] = 60.0
     slips: Size = 1.0
@@ -65,27 +65,22 @@ class GnssOptions:
     fault_start: Annotated[float, Range(0.0, 1e6)] = 30.0
     baud: Annotated[int, Range(9600, 10_000_000)] = 921_600
 
+    @classmethod
+    def perfect(cls) -> GnssOptions:
+        """A receiver without errors; of the air only what the broadcast models tell exactly."""
+        return cls(missing=0.0, half_cycle=0, **dict.fromkeys(_ERRORS, 0.0))  # type: ignore[arg-type]
 
-PERFECT = GnssOptions(
-    missing=0.0,
-    orbit=0.0,
-    satellite_clock=0.0,
-    ionosphere_residual=0.0,
-    troposphere_residual=0.0,
-    clock=0.0,
-    clock_drift_ppm=0.0,
-    inter_system=0.0,
-    code=0.0,
-    phase=0.0,
-    doppler=0.0,
-    multipath=0.0,
-    carrier_multipath=0.0,
-    slips=0.0,
-    half_cycle=0,
+    @classmethod
+    def base(cls) -> GnssOptions:
+        """A base station in the open, with a good antenna. Satellites and air are those of the flight."""
+        return cls(rate_hz=1.0, missing=0.0, code=0.2, multipath=0.5, slips=0.2)
+
+
+_ERRORS = (
+    *("orbit", "satellite_clock", "ionosphere_residual", "troposphere_residual", "clock", "clock_drift_ppm"),
+    *("inter_system", "code", "phase", "doppler", "multipath", "carrier_multipath", "slips"),
 )
-"""No error but the air's delays, which the broadcast models tell exactly."""
-BASE = GnssOptions(rate_hz=1.0, missing=0.0, code=0.2, multipath=0.5, slips=0.2)
-"""A base station in the open, on a good antenna; of the satellites and the air it shares the flight's errors."""
+"""What is 0 of a perfect receiver."""
 
 
 def intervals(text: str, key: str) -> Intervals:

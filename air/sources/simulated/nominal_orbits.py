@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from air.gnss.gnss_time import BEIDOU_EPOCH_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
 from air.gnss.orbit import EARTH_RATE
@@ -111,9 +113,9 @@ def _glonass(start_ns: int, rng: np.random.Generator) -> Iterator[GlonassEphemer
             t_ns=start_ns,
             satellite=f"R{i + 1:02d}",
             toe_ns=start_ns,
-            position=(float(position[0]), float(position[1]), float(position[2])),
-            velocity=(float(velocity[0]), float(velocity[1]), float(velocity[2])),
-            acceleration=_three(_PULL * rng.integers(-2, 3, 3)),
+            position=_three(position),
+            velocity=_three(velocity),
+            acceleration=_three(_PULL * rng.integers(-2, 3, 3).astype(float)),
             tau=float(rng.uniform(-1e-4, 1e-4)),
             gamma=float(rng.uniform(-2e-12, 2e-12)),
             channel=_CHANNELS[i],
@@ -128,7 +130,7 @@ def _in_plane(node: float, tilt: float, argument: float) -> F64:
     return np.asarray(np.cos(argument) * np.array([np.cos(node), np.sin(node), 0.0]) + np.sin(argument) * across)
 
 
-def _three(values: F64) -> tuple[float, float, float]:
+def _three(values: npt.NDArray[np.floating[Any]]) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 

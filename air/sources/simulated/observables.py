@@ -13,14 +13,14 @@ from itertools import pairwise
 import numpy as np
 
 from air.gnss.signals import LIGHT
+from air.sources.simulated.antenna import Antenna
 from air.sources.simulated.gnss_options import GnssOptions, Intervals, intervals
 from air.sources.simulated.multipath import Multipath, multipath, multipath_growth
 from air.sources.simulated.receiver_clock import ReceiverClock
 from air.sources.simulated.sky import Air, Sky, l1_squared_over
 from common.arrays import F64, Bool
+from common.geo import T_ecef_enu
 
-Antenna = Callable[[F64], tuple[F64, F64]]
-"""Position and velocity (N, 3) of an antenna in ECEF, m and m/s, at times (N,) s of the flight."""
 Blocked = Callable[[F64, F64], Bool]
 """Whether buildings or ground hide the directions (S, 3), in ENU, from a place (3,) m, in world."""
 
@@ -61,16 +61,10 @@ class Observables:
 class Observer:
     """A receiver with its antenna, clock and noise, under a sky. `part` is the first of its random streams."""
 
-    def __init__(
-        self,
-        sky: Sky,
-        antenna: Antenna,
-        hidden: Callable[[float, F64], Bool] | None,
-        options: GnssOptions,
-        seed: int,
-        part: int,
-    ):
-        self._sky, self._antenna, self._hidden, self._options = sky, antenna, hidden, options
+    def __init__(self, sky: Sky, antenna: Antenna, blocked: Blocked | None, options: GnssOptions, seed: int, part: int):
+        """Raises SourceError for impossible times in the options."""
+        self._sky, self._antenna, self._blocked, self._options = sky, antenna, blocked, options
+        self._T_world_ecef = T_ecef_enu(sky.datum).inverse()
         self._key = seed, part
         self._clock = ReceiverClock(options.clock, options.clock_drift_ppm, seed, part + CLOCK)
         rng = np.random.default_rng([seed, part + CHANNELS])
@@ -98,8 +92,8 @@ class Observer:
         position, _ = self._antenna(np.array([float(second)]))
         air = self._sky.air(float(second), position[0])
         seen = air.elevation >= np.radians(self._options.mask_deg)
-        if self._hidden is not None and seen.any():
-            seen[seen] = ~self._hidden(float(second), air.direction[seen])
+        if self._blocked is not None and seen.any():
+            seen[seen] = ~self._blocked(self._T_world_ecef.apply(position[0]), air.direction[seen])
         return air, state, seen
 
     def _observe(

@@ -20,8 +20,9 @@ from air.gnss.signals import LIGHT, frequency
 from air.sources.simulated.constellation import Constellation
 from air.sources.simulated.gnss_options import GnssOptions
 from common.arrays import F64
-from common.geo import ecef_to_geodetic
+from common.geo import ecef_to_geodetic, geodetic_to_ecef
 from common.measurements import GlonassEphemeris
+from common.messages import Datum
 
 _ERRORS, _FAULTS = 51, 52
 SIGNALS = {"G": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "7I"), "R": ("1C", "2C")}
@@ -57,12 +58,13 @@ class Air:
 
 
 class Sky:
-    """S satellites with two signals each, their errors and the air, over the place (3,) m, ECEF, of the flight."""
+    """S satellites with two signals each, their errors and the air, over a flight that starts at the datum."""
 
-    def __init__(self, constellation: Constellation, options: GnssOptions, place: F64, start_ns: int, seed: int):
+    def __init__(self, constellation: Constellation, options: GnssOptions, datum: Datum, start_ns: int, seed: int):
         self.constellation = constellation
         self.satellites = constellation.satellites
         self.start_ns = start_ns
+        self.datum = datum
         self.options = options
         n = len(self.satellites)
         rng = np.random.default_rng([seed, _ERRORS])
@@ -82,6 +84,7 @@ class Sky:
         self.is_glonass = np.array([isinstance(r, GlonassEphemeris) for r in constellation.reference])
         self.faulty = np.zeros(n, bool)
         if options.fault:
+            place = geodetic_to_ecef(datum.latitude_deg, datum.longitude_deg, datum.height)
             high = np.flatnonzero(self.air(options.fault_start, place).elevation > _FAULT_ELEVATION)
             self.faulty[np.random.default_rng([seed, _FAULTS]).permutation(high)[: options.fault]] = True
 
@@ -123,7 +126,8 @@ class Sky:
                 [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1
             ),
             ionosphere=self.options.ionosphere * delay + slant * self._ionosphere_error.at(np.array(t_s)),
-            troposphere=self.options.troposphere * wet_and_dry + self._troposphere_error.at(np.array(t_s)) / np.sin(angle),
+            troposphere=self.options.troposphere * wet_and_dry
+            + self._troposphere_error.at(np.array(t_s)) / np.sin(angle),
         )
 
     def _satellites(self, t_s: F64) -> tuple[F64, F64, F64, F64, F64]:
