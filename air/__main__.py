@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 from common import log
@@ -157,7 +156,7 @@ def _info(args: argparse.Namespace) -> int:
     from rich.table import Table
     from tqdm import tqdm
 
-    from air.info import summarize, table
+    from air.info import as_dict, summarize, table
     from air.sources.source import open_source
 
     source = open_source(args.source)
@@ -165,15 +164,20 @@ def _info(args: argparse.Namespace) -> int:
     passing = tqdm(source, unit=" items", leave=False, disable=True if args.quiet else None)
     summary = summarize(source, passing)
     if args.json:
-        print(json.dumps(asdict(summary), ensure_ascii=False, indent=2))
+        print(json.dumps(as_dict(summary), ensure_ascii=False, indent=2))
         return 0
     heading, *rows = table(summary)
-    shown = Table(*heading, title=f"{summary.url}: {summary.duration_s:.1f} s", box=None, title_justify="left")
-    for column in shown.columns[1:]:
-        column.justify = "right"
+    shown = Table(box=None, pad_edge=False)
+    for i, name in enumerate(heading):
+        shown.add_column(name, justify="right" if i else "left", no_wrap=True)
     for row in rows:
         shown.add_row(*row)
-    Console().print(shown)
+    print(f"{summary.url}: {summary.duration_s:.1f} s")
+    Console(markup=False, highlight=False).print(shown)
+    if summary.counts is not None:
+        seen = summary.counts
+        print(f"{seen.received_bytes} bytes, {seen.dropped_bytes} dropped in {seen.bursts} bursts; ", end="")
+        print(f"{seen.frames.total()} frames, {seen.refused} refused, {seen.missing} missing")
     for problem in summary.problems:
         print(f"{problem.name}: {problem.text}")
     return 0

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol, runtime_checkable
 
 from air.sources.source import Problem, Sensed, Source
+from common.counts import Counts
 from common.measurements import (
     CameraFrame,
     ClockState,
@@ -32,7 +34,7 @@ class Stream:
     """One stream of a source: `name` is the kind and the device, times in ns of its stamps.
 
     `rate_hz` is None for fewer than two stamps. `gaps` counts intervals of more than 1.5 median intervals, and
-    `backward` stamps that lie before the one before them; both are None for what comes when it pleases.
+    `backward` stamps that lie before the one before them. All three are None for what comes when it pleases.
     """
 
     name: str
@@ -45,13 +47,27 @@ class Stream:
     backward: int | None
 
 
+@runtime_checkable
+class Counted(Protocol):
+    """A source of device bytes, which counts what it had to drop."""
+
+    @property
+    def counts(self) -> Counts:
+        """What its driver has seen."""
+        ...
+
+
 @dataclass(frozen=True)
 class Summary:
-    """All streams of a source by name, its duration in s, and what was wrong."""
+    """All streams of a source by name, its duration in s, and what was wrong.
+
+    `counts` are those of its driver, None for a source that has no device's bytes.
+    """
 
     url: str
     streams: tuple[Stream, ...]
     duration_s: float
+    counts: Counts | None
     problems: tuple[Problem, ...]
 
 
@@ -65,12 +81,13 @@ def summarize(source: Source, items: Iterable[Sensed] | None = None) -> Summary:
     steady_ends = [(s.first_ns, s.last_ns) for s in streams if s.gaps is not None]
     ends = steady_ends or [(s.first_ns, s.last_ns) for s in streams]
     duration_ns = max(last for _, last in ends) - min(first for first, _ in ends) if ends else 0
-    return Summary(source.url, streams, duration_ns * 1e-9, tuple(source.problems))
+    counts = source.counts if isinstance(source, Counted) else None
+    return Summary(source.url, streams, duration_ns * 1e-9, counts, tuple(source.problems))
 
 
 def table(summary: Summary) -> list[tuple[str, ...]]:
     """Rows of text about the streams, the heading first; a dash where a figure makes no sense."""
-    rows: list[tuple[str, ...]] = [("stream", "count", "rate Hz", "first s", "last s", "gaps", "longest s", "backward")]
+    rows: list[tuple[str, ...]] = [("stream", "count", "rate Hz", "first s", "last s", "gaps", "longest s", "back")]
     start_ns = min((s.first_ns for s in summary.streams if s.gaps is not None), default=None)
     if start_ns is None:
         start_ns = min((s.first_ns for s in summary.streams), default=0)
@@ -79,6 +96,13 @@ def table(summary: Summary) -> list[tuple[str, ...]]:
         rate, longest = _text(s.rate_hz, ".2f"), _text(s.longest_gap_s, ".3f")
         rows.append((s.name, str(s.count), rate, *seconds, _text(s.gaps, "d"), longest, _text(s.backward, "d")))
     return rows
+
+
+def as_dict(summary: Summary) -> dict[str, Any]:
+    """The summary as plain values, for JSON."""
+    counts = summary.counts
+    told = None if counts is None else vars(counts) | {"frames": dict(counts.frames)}
+    return asdict(replace(summary, counts=None)) | {"counts": told}
 
 
 def _text(value: float | None, form: str) -> str:
@@ -138,7 +162,7 @@ class _Tally:
 
     def stream(self, name: str) -> Stream:
         span_s = (self.last_ns - self.first_ns) * 1e-9
-        rate_hz = (self.count - 1) / span_s if span_s > 0 else None
+        rate_hz = (self.count - 1) / span_s if self.steady and span_s > 0 else None
         gaps = self._gaps() if self.steady else None
         longest_s = self.longest_ns * 1e-9 if gaps else None
         backward = self.backward if self.steady else None

@@ -124,6 +124,16 @@ def test_the_command_prints_a_table_or_json(
     assert summary["streams"][1]["rate_hz"] == pytest.approx(200.0, abs=0.01)
 
 
+def test_what_a_driver_dropped_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "f.xbus").write_bytes(b"no frame at all")
+    url = f"xbus:{tmp_path / 'f.xbus'}"
+    assert main(["info", url, "--json"]) == 0
+    counts = json.loads(capfd.readouterr().out)["counts"]
+    assert (counts["received_bytes"], counts["dropped_bytes"], counts["frames"]) == (15, 15, {})
+    assert main(["info", url]) == 0
+    assert "15 bytes, 15 dropped in 1 bursts" in capfd.readouterr().out
+
+
 def test_the_command_refuses_an_unknown_source_in_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "nonsense:x"]) == 1
     assert capfd.readouterr().err.count("\n") == 1
