@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import stat
+import termios
 from pathlib import Path
 from typing import Protocol
 
@@ -66,8 +67,13 @@ class _SerialLink:
         self._port.write(data)
 
     def set_baud(self, baud: int) -> bool:
-        self._port.baudrate = baud
-        self._port.reset_input_buffer()
+        try:
+            self._port.baudrate = baud
+            self._port.reset_input_buffer()
+        except termios.error as error:
+            raise OSError(*error.args) from error
+        except ValueError:  # a rate that this chip does not have
+            return False
         return True
 
     def close(self) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -211,3 +213,61 @@ def test_the_capture_hands_out_jpeg_frames_as_they_come(tmp_path: Path) -> None:
     capture.close()
     assert [shot.stamp_ns // MS for shot in shots] == times_ms
     assert all(shot.encoding is Encoding.JPEG and shot.data[:2] == b"\xff\xd8" for shot in shots)
+
+
+class FakeColourFrame:
+    def __init__(self, known: dict[str, int]) -> None:
+        self._known = known
+
+    def supports_frame_metadata(self, kind: str) -> bool:
+        return kind in self._known
+
+    def get_frame_metadata(self, kind: str) -> int:
+        return self._known[kind]
+
+    def get_width(self) -> int:
+        return 4
+
+    def get_height(self) -> int:
+        return 2
+
+    def get_data(self) -> bytes:
+        return bytes(range(24))
+
+
+def fake_realsense(frames: list[FakeColourFrame]) -> SimpleNamespace:
+    """As much of pyrealsense2 as the capture uses."""
+
+    def wait_for_frames(_timeout_ms: int) -> SimpleNamespace:
+        if not frames:
+            raise RuntimeError("Frame didn't arrive\nwithin 2000")
+        return SimpleNamespace(get_color_frame=lambda: frames.pop(0))
+
+    nothing = SimpleNamespace(enable_device=lambda _: None, enable_stream=lambda *_: None)
+    pipeline = SimpleNamespace(start=lambda _: None, stop=lambda: None, wait_for_frames=wait_for_frames)
+    kinds = ("sensor_timestamp", "actual_exposure", "gain_level")
+    return SimpleNamespace(
+        config=lambda: nothing,
+        pipeline=lambda: pipeline,
+        stream=SimpleNamespace(color=0),
+        format=SimpleNamespace(bgr8=0),
+        frame_metadata_value=SimpleNamespace(**{kind: kind for kind in kinds}),
+    )
+
+
+def test_a_realsense_stamps_the_middle_of_the_exposure_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = FakeColourFrame({"sensor_timestamp": 2**32 - 10_000, "actual_exposure": 8000, "gain_level": 64})
+    wrapped = FakeColourFrame({"sensor_timestamp": 23_333})
+    library = fake_realsense([first, FakeColourFrame({}), wrapped])
+    monkeypatch.setitem(sys.modules, "pyrealsense2", library)
+    capture = open_capture(CameraConfig("realsense:0123"))
+    assert capture.scale is TimeScale.DEVICE
+    assert capture.read() == Shot((2**32 - 10_000) * 1000, 4, 2, Encoding.BGR8, bytes(range(24)), 0.008, 64)
+    assert capture.read() is None  # without metadata
+    later = capture.read()
+    assert later is not None
+    assert later.stamp_ns == (2**32 + 23_333) * 1000
+    assert (later.exposure_s, later.gain) == (None, None)
+    with pytest.raises(OSError, match="Frame didn't arrive within 2000"):
+        capture.read()
+    capture.close()

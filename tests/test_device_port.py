@@ -18,7 +18,7 @@ from air.devices.settings import PortConfig
 from air.devices.status import State
 from common.errors import DeviceError
 from common.link import open_link
-from common.measurements import RawBytes, ReceiverSolution
+from common.measurements import Measurement, RawBytes, ReceiverSolution
 
 
 class Listener:
@@ -184,3 +184,16 @@ def test_a_device_behind_an_address_is_read_as_well() -> None:
         wait_for(lambda: len(listener.solutions()) == 4, 2.0)
         reader.close()
         connection.close()
+
+
+def test_a_driver_that_fails_is_begun_anew_and_named() -> None:
+    class Failing(LineDriver):
+        def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
+            raise RuntimeError("a fault of ours")
+
+    config = PortConfig("/dev/luojia-gnss", 9600)
+    reader = Port(Failing(), config, Listener().take, lambda _place, baud: WireAt(9600, baud))
+    reader.start()
+    wait_for(lambda: reader.status().counts["opened"] >= 2, 3.0)
+    wait_for(lambda: "a fault in the program" in reader.status().fault, 2.0)
+    reader.close()

@@ -111,6 +111,9 @@ class CameraReader:
                 self._read(capture)
         except OSError as error:
             self._watch.closed(f"was lost: {' '.join(str(error).split())}; waiting for it to come back")
+        except Exception:  # a fault of ours: the other devices go on, and this one begins anew
+            log.exception("%s: reading failed", NAME)
+            self._watch.closed("reading failed by a fault in the program; the log tells more")
         finally:
             capture.close()
 

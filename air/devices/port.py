@@ -106,6 +106,9 @@ class Port:
                 self._look_after(link)
         except OSError as error:
             self._lost(f"was lost: {' '.join(str(error).split())}; waiting for it to come back")
+        except Exception:  # a fault of ours: the other devices go on, and this one begins anew
+            log.exception("%s: reading failed", self._driver.device)
+            self._lost("reading failed by a fault in the program; the log tells more")
         finally:
             link.close()
 
@@ -174,4 +177,4 @@ class Port:
         """Log what has changed."""
         if text and text != self._said:
             log.log(logging.INFO if text.endswith("is open") else logging.WARNING, "%s: %s", self._driver.device, text)
-        self._said = text or self._said
+        self._said = text
