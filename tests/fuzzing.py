@@ -191,14 +191,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=random.randrange(1 << 32), help="default: another one each time")
     parser.add_argument("--case", type=int, help="only this one")
     args = parser.parse_args()
-    log.info("| reader | cases | slowest, ms | most memory, MB | growth, MB |\n| --- | --- | --- | --- | --- |")
+    log.info("| reader | cases | slowest, ms | most memory, kB | growth, MB |\n| --- | --- | --- | --- | --- |")
     for name in args.readers or sorted(READERS):
         reader = READERS[name]
         if args.case is not None:
             reader.read(mutated(reader, args.seed, args.case))
             continue
         out = fuzz(reader, args.seconds, args.seed)
-        memory = f"{out.peak_bytes / 1e6:.1f} | {out.growth_bytes / 1e6:.1f}"
+        memory = f"{out.peak_bytes / 1e3:.0f} | {out.growth_bytes / 1e6:.1f}"
         log.info(f"| {name} | {out.cases} | {1e3 * out.slowest_s:.1f} | {memory} |")
 
 
