@@ -9,6 +9,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -230,11 +231,10 @@ class Recorder:
         """Leave the file as it was after the last flush: without an index, but readable."""
         self._fault = fault
         log.error("recording stopped: %s", fault)
-        try:
+        with suppress(OSError):  # what was not flushed is lost
             self._file.close()
-        except OSError as error:
-            log.debug("what was not flushed is lost: %s", error)
-        os.truncate(self.path, self._flushed_bytes)
+        with suppress(OSError):  # the disk may be gone altogether
+            os.truncate(self.path, self._flushed_bytes)
 
 
 class CameraPacker:

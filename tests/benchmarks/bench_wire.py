@@ -14,6 +14,7 @@ from figures import Figure
 
 from air.alignment.alignment import thumbnail
 from air.sources.simulated.survey import Survey, SurveyOptions
+from common.measurements import CameraFrame, Encoding, GnssEpoch, ImuSample
 from common.messages import Datum, Health, Keyframe, Level, MapDigest, MapTile, Mode, Pose, TileId, TileRequest
 from common.streams import STREAMS
 from common.wire import decode, encode
@@ -56,12 +57,19 @@ def messages():
     rows = np.column_stack([np.zeros(2000, np.int32), np.indices((40, 50)).reshape(2, -1).T, np.full(2000, 7)])
     rows = rows.astype(np.int32)
     sigma = np.array([0.02, 0.02, 0.03])
+    columns = np.full(40, 2e7)
+    signals = (("G05",) * 40, ("1C",) * 40, *[columns] * 5, columns < 0, *[columns] * 3, np.zeros(40, np.int32))
     single = {
         "datum": Datum(FLIGHT, 30.5, 114.4, 62.0),
         "pose": Pose(FLIGHT, photo.t_ns, 3, pose, np.array([3.0, 0.1, 0.0]), sigma, Mode.PHOTOGRAMMETRIC),
         "health": Health(photo.t_ns, "mapper", Level.OK, "12 photos placed", {"placed": 12, "tiles": 20}),
         "keyframe": Keyframe(FLIGHT, 0, 1, photo.t_ns, photo.name, pose, truth.camera, sigma, thumbnail(image)),
         "digest of 2000 tiles": MapDigest(FLIGHT, photo.t_ns, rows),
+        "IMU sample": ImuSample(photo.t_ns, sigma, sigma, sigma, np.array([1.0, 0, 0, 0])),
+        "GNSS epoch of 40 signals": GnssEpoch(photo.t_ns, "gnss", *signals),
+        "raw frame of 1280 × 720 px": CameraFrame(
+            photo.t_ns, "down", 0, 1280, 720, Encoding.BGR8, bytes(1280 * 720 * 3)
+        ),
         "request of 2000 tiles": TileRequest(FLIGHT, np.ascontiguousarray(rows[:, :3])),
     }
     tiles = {f"tile {x}, {y}": tile_of(truth.world, x, y) for x in (-1, 0) for y in (-1, 0)}
@@ -92,7 +100,7 @@ def main():
         size = Figure(name, "", 0, most=limit_of(message))
         encoded = milliseconds(lambda message=message: encode(message))
         decoded = milliseconds(lambda message=message, payload=payload: decode(type(message), payload))
-        print(f"| {name} | {encoded:.2f} | {decoded:.2f} | {size.cell(len(payload))} | ≤ {size.most} |")
+        print(f"| {name} | {encoded:.3f} | {decoded:.3f} | {size.cell(len(payload))} | ≤ {size.most} |")
     print(f"\nTiles: {CELLS} × {CELLS} cells. One thread.\n")
 
 
