@@ -21,12 +21,12 @@ COLOUR = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
 class Bag:
     """Writes a small bag of either generation."""
 
-    def __init__(self, path: Path, ros1: bool):
+    def __init__(self, path: Path, ros1: bool, storage: StoragePlugin = StoragePlugin.SQLITE3):
         self.ros1 = ros1
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         for name, text in gnss_comm.DEFINITIONS.items():
             self.store.register(get_types_from_msg(text, f"gnss_comm/msg/{name}"))
-        self.writer = Writer1(path) if ros1 else Writer2(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
+        self.writer = Writer1(path) if ros1 else Writer2(path, version=8, storage_plugin=storage)
         self.connections = {}
 
     def make(self, kind: str, **values):
@@ -139,8 +139,8 @@ class Bag:
         return self.gnss("GnssPVTSolnMsg", **values)
 
 
-def write_bag(path: Path, ros1: bool) -> Path:
-    bag = Bag(path, ros1)
+def write_bag(path: Path, ros1: bool, storage: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
+    bag = Bag(path, ros1, storage)
     jpeg = io.BytesIO()
     Image.fromarray(COLOUR).save(jpeg, "JPEG")
     with bag.writer:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bag_samples import COLOUR, GREY, START_S, TOW, WEEK, Bag, write_bag
+from rosbags.rosbag2 import StoragePlugin
 
 from air.gnss.gnss_time import from_week
 from air.sources import gnss_comm
@@ -26,10 +27,17 @@ from common.measurements import (
 )
 
 
-@pytest.fixture(scope="module", params=["ros1", "ros2"])
-def bag_path(request, tmp_path_factory) -> Path:
+@pytest.fixture(scope="module", params=["ros1", "sqlite3", "mcap"])
+def bag_path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bags")
-    return write_bag(folder / ("f.bag" if request.param == "ros1" else "f"), request.param == "ros1")
+    if request.param == "ros1":
+        return write_bag(folder / "f.bag", ros1=True)
+    return write_bag(folder / "f", ros1=False, storage=StoragePlugin[request.param.upper()])
+
+
+def test_a_single_file_of_ros_2_is_a_bag_too(tmp_path: Path) -> None:
+    (file,) = write_bag(tmp_path / "f", ros1=False, storage=StoragePlugin.MCAP).glob("*.mcap")
+    assert len(list(open_source(f"bag:{file}"))) == 31
 
 
 def gpst_ns(offset_s: float) -> int:

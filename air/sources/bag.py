@@ -155,7 +155,7 @@ def _messages(path: Path, topics: dict[str, Topic], offset_s: float | None, faul
                     t_ns = _stamp(message, arrival_ns, offset_s)
                     item = CONVERTERS[_kind(connection.msgtype)](message, topics[connection.topic].device, t_ns)
                 except Exception as error:  # a damaged message is any message
-                    faults.add(connection.topic, f"a message is left out: {one_line(error)}")
+                    faults.add(connection.topic, "a message is left out", one_line(error))
                     continue
                 if isinstance(item, CameraFrame):
                     frames[item.camera] = frames.get(item.camera, -1) + 1

@@ -21,11 +21,16 @@ they are: the geoid's undulation, 30 m in the mean square over the earth (EGM96)
 class Faults:
     """What is wrong with a recording. Faults of one kind are counted, so that a bad file fills no memory."""
 
+    MOST = 100
+    """Kinds of faults that are told apart; what comes then is counted as others."""
+
     def __init__(self) -> None:
         self._seen: dict[tuple[str, str], tuple[int, str]] = {}
 
     def add(self, name: str, text: str, where: str = "") -> None:
         """Count a fault of the part `name`; of equal ones only the first `where` is kept."""
+        if (name, text) not in self._seen and len(self._seen) >= self.MOST:
+            name, text, where = "others", "more faults than are told", ""
         count, first = self._seen.get((name, text), (0, where))
         self._seen[name, text] = (count + 1, first)
 
