@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from bus_network import free_endpoint, wait_until
 from live_system import Program
-from recording_samples import START_NS, flight, frame, imu
+from recording_samples import START_NS, flight, frame, imu, stream_of
 
 from air.config import CameraFormat, RecorderConfig
 from air.recorder import ROLE, Arrival, Inflow, Recorder
@@ -29,7 +29,7 @@ from common.clock import ManualClock
 from common.errors import SourceError
 from common.keys import alive_key, message_key, stream_key
 from common.measurements import CameraFrame, Encoding, ImuSample
-from common.messages import Health, Level
+from common.messages import Health, Level, Photo
 from common.recording.reader import Recording
 from common.streams import HEALTH, RAW_CAMERA, RAW_IMU
 from common.wire import decode, encode
@@ -297,3 +297,22 @@ def test_the_imu_comes_back_from_a_recording_as_a_source(tmp_path: Path, clock: 
     assert [s.t_ns for s in samples[1:]] == [imu(i).t_ns for i in range(100)]
     np.testing.assert_array_equal(samples[-1].accel, imu(99).accel)
     assert not source.problems
+
+
+def test_a_real_flight_comes_back_from_its_recording_unchanged(
+    real_data: Callable[[str], Path], tmp_path: Path, clock: ManualClock
+) -> None:
+    flown = list(open_source(f"euroc:{real_data('euroc_v101_micro')}"))
+    recorder = recorder_in(tmp_path, clock)
+    for item in flown:
+        assert not isinstance(item, Photo)
+        recorder.write([Arrival(item.t_ns, message_key("uav1", stream_of(item), item), encode(item))])
+    recorder.close()
+    source = open_source(f"mcap:{recorder.path}")
+    back = list(source)
+    assert not source.problems
+    assert [type(item) for item in back] == [type(item) for item in flown]
+    for before, after in zip(flown, back, strict=True):
+        assert not isinstance(before, Photo)
+        assert not isinstance(after, Photo)
+        assert encode(before) == encode(after)
