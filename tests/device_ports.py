@@ -22,6 +22,7 @@ class VirtualPort:
 
     def __init__(self, link: Path) -> None:
         self.link = link
+        self.sent = 0
         self._master: int | None = None
         self._slave: int | None = None
 
@@ -42,7 +43,7 @@ class VirtualPort:
         """Bytes from the device; lost while nobody reads, as on a wire."""
         if self._master is not None:
             with contextlib.suppress(BlockingIOError):
-                os.write(self._master, data)
+                self.sent += os.write(self._master, data)
 
     def sent_by_host(self) -> bytes:
         try:

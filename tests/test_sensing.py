@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import random
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from bus_network import client_of, collect, free_endpoint
-from device_ports import Player, VirtualPort, evenly, wait_for
-from live_system import ROOT, Program
+from bus_network import client_of, collect
+from device_aircraft import Aircraft
+from device_ports import wait_for
 
 from common.keys import all_of
 from common.measurements import ClockPhase, ClockState, ImuSample, RawBytes, ReceiverSolution
@@ -21,55 +19,10 @@ from common.streams import CLOCK, HEALTH, RAW_BYTES, RAW_GNSS, RAW_IMU, RAW_SOLU
 from common.wire import decode
 
 
-class Aircraft:
-    """Two devices behind ports with stable names, and what runs on them."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.endpoint = folder, free_endpoint()
-        self.gnss, self.imu = VirtualPort(folder / "luojia-gnss"), VirtualPort(folder / "luojia-imu")
-        self.players: list[Player] = []
-        self.programs: list[Program] = []
-        self.config = folder / "air.toml"
-        self.config.write_text(
-            f'source = "live:"\n[bus]\nlisten = ["{self.endpoint}"]\nconnect = []\nshared_memory = false\n'
-            f'[devices.gnss]\nport = "{self.gnss.link}"\n[devices.imu]\nport = "{self.imu.link}"\n'
-        )
-
-    def play(self, port: VirtualPort, data: bytes, duration_s: float) -> None:
-        self.players.append(Player(port, evenly(data, duration_s)))
-
-    def run(self) -> Program:
-        program = Program(["air", "run", "--config", str(self.config)], self.folder / "air.log")
-        self.programs.append(program)
-        return program
-
-    def check(self, *options: str) -> tuple[int, str]:
-        """Exit code and output."""
-        command = [sys.executable, "-m", "air", "check", "--config", str(self.config), *options]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=30.0)
-        assert not done.stderr
-        return done.returncode, done.stdout
-
-    def close(self) -> None:
-        for program in self.programs:
-            program.process.kill()
-            program.process.wait()
-        for player in self.players:
-            player.stop()
-        for port in (self.gnss, self.imu):
-            if port.link.is_symlink():
-                port.unplug()
-
-
 @pytest.fixture
 def aircraft(tmp_path: Path, real_data: Callable[[str], Path]) -> Iterator[Aircraft]:
     """Two ports into which recordings are played at the rate at which they were made."""
-    system = Aircraft(tmp_path)
-    system.gnss.plug()
-    system.imu.plug()
-    (xsens,) = real_data("xsens").glob("*.bin")
-    system.play(system.gnss, (real_data("gnss") / "nhm.ubx").read_bytes(), 113.0)
-    system.play(system.imu, xsens.read_bytes(), 47.5)
+    system = Aircraft(tmp_path, real_data("gnss"), real_data("xsens"))
     yield system
     system.close()
 
