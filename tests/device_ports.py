@@ -23,33 +23,34 @@ class VirtualPort:
     def __init__(self, link: Path) -> None:
         self.link = link
         self.sent = 0
-        self._master: int | None = None
-        self._slave: int | None = None
+        self._ends: tuple[int, int] | None = None
+        self._lock = threading.Lock()
 
     def plug(self) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.link.symlink_to(os.ttyname(self._slave))
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        with self._lock:
+            self._ends = master, slave
+            self.link.symlink_to(os.ttyname(slave))
 
     def unplug(self) -> None:
-        self.link.unlink()
-        for end in (self._master, self._slave):
-            if end is not None:
+        with self._lock:
+            self.link.unlink()
+            for end in self._ends or ():
                 os.close(end)
-        self._master = self._slave = None
+            self._ends = None
 
     def send(self, data: bytes) -> None:
         """Bytes from the device; lost while nobody reads, as on a wire."""
-        if self._master is not None:
-            with contextlib.suppress(BlockingIOError):
-                self.sent += os.write(self._master, data)
+        with self._lock, contextlib.suppress(BlockingIOError):
+            if self._ends is not None:
+                self.sent += os.write(self._ends[0], data)
 
     def sent_by_host(self) -> bytes:
-        try:
-            return os.read(self._master, 65_536) if self._master is not None else b""
-        except BlockingIOError:
-            return b""
+        with self._lock, contextlib.suppress(BlockingIOError):
+            return os.read(self._ends[0], 65_536) if self._ends is not None else b""
+        return b""
 
 
 class Player:
