@@ -60,6 +60,43 @@ def single_point(folder: Path, obs: Path, nav: Path, systems: str, mask_deg: flo
     return [_solution(line.split()) for line in out.read_text().splitlines() if line[:1] != "%"]
 
 
+@dataclass(frozen=True, eq=False)
+class RelativeSolution:
+    """A carrier-phase solution against a base: ECEF position m; `fixed` when its ambiguities are whole numbers."""
+
+    t_ns: int
+    position: F64
+    fixed: bool
+
+
+def kinematic(folder: Path, rover: Path, base: Path, nav: Path, base_position: F64) -> list[RelativeSolution]:
+    """What rnx2rtkp finds epoch by epoch with two bands of GPS, Galileo and GLONASS, the ambiguities not held."""
+    settings = {
+        "pos1-posmode": "kinematic",
+        "pos1-frequency": "l1+l2",
+        "pos1-elmask": 15,
+        "pos1-ionoopt": "brdc",
+        "pos1-tropopt": "saas",
+        "pos1-navsys": sum(_SYSTEMS[system] for system in "GRE"),
+        "pos2-armode": "continuous",
+        "pos2-gloarmode": "off",
+        "out-solformat": "xyz",
+        "out-timeform": "tow",
+        "out-timendec": 6,
+        "ant2-postype": "xyz",
+        **{f"ant2-pos{i + 1}": f"{value:.4f}" for i, value in enumerate(base_position.tolist())},
+    }
+    (folder / "rtk.conf").write_text("".join(f"{key} ={value}\n" for key, value in settings.items()))
+    out = folder / "rtk.pos"
+    command = [program("rnx2rtkp"), "-k", folder / "rtk.conf", "-o", out, rover, base, nav]
+    subprocess.run([str(part) for part in command], capture_output=True, check=False)
+    rows = [line.split() for line in out.read_text().splitlines() if line[:1] != "%"]
+    return [
+        RelativeSolution(from_week(int(row[0]), float(row[1])), np.array(row[2:5], float), row[5] == "1")
+        for row in rows
+    ]
+
+
 def _solution(fields: list[str]) -> Solution:
     position, velocity = np.array(fields[2:5], float), np.array(fields[15:18], float)
     return Solution(from_week(int(fields[0]), float(fields[1])), position, velocity, int(fields[6]))

@@ -1,0 +1,111 @@
+"""The simulated GNSS: what RTKLIB finds in it, which error does what, and how long a second takes.
+
+A rover flies circles at 3 m/s, 40 m up, some 190 m from a base station. RTKLIB's rnx2rtkp gets the exported RINEX:
+single points with one band, broadcast ionosphere and Saastamoinen, elevation mask 10°, all systems; carrier phase
+(GPS, Galileo, GLONASS in two bands, mask 15°) epoch by epoch, without holding ambiguities.
+
+python tests/benchmarks/bench_gnss_simulator.py
+"""
+
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import rtklib
+from gnss_scene import BASE_ECEF, correlation_time, exported, rover
+
+from air.sources.simulated.gnss_options import GnssOptions
+
+SEEDS = (1, 2, 3)
+DURATION_S = 1200.0
+PERFECT, DEFAULT = GnssOptions.perfect(), GnssOptions()
+ALONE = {
+    "none": (),
+    "multipath of the code": ("multipath",),
+    "ionosphere's residual": ("ionosphere_residual",),
+    "troposphere's residual": ("troposphere_residual",),
+    "orbits and satellite clocks": ("orbit", "satellite_clock"),
+    "noise of the code": ("code",),
+    "all": tuple(field.name for field in fields(GnssOptions)),
+}
+
+
+def main():
+    """Print the tables."""
+    speed()
+    if shutil.which("rnx2rtkp") is None:
+        print("\nskipped: RTKLIB's rnx2rtkp is not installed (Debian: apt install rtklib)")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        single_points(Path(folder))
+        carrier_phases(Path(folder))
+
+
+def speed():
+    """The time of this processor for a second of flight."""
+    print("| a second of flight | CPU, ms | target |\n|---|---|---|")
+    receiver, duration_s = rover(replace(DEFAULT, missing=0.0), 60.0), 60.0
+    for name, run in (
+        ("raw measurements at 10 Hz", receiver.observations),
+        ("all UBX bytes, own solution and navigation messages", receiver.packets),
+    ):
+        begun = time.process_time()
+        count = sum(1 for _ in run())
+        spent = (time.process_time() - begun) / duration_s * 1e3
+        print(f"| {name} ({count / duration_s:.0f} a second) | {spent:.1f} | < 50 |", flush=True)
+
+
+def single_points(folder):
+    """Errors of RTKLIB's single points, with one error at a time."""
+    print("\n| errors that are on | horizontal RMS, m | vertical RMS, m | correlated over, s | positions |")
+    print("|---|---|---|---|---|")
+    for name, on in tqdm(ALONE.items(), leave=False, disable=None):
+        options = replace(PERFECT, **{key: getattr(DEFAULT, key) for key in on} | {"rate_hz": 0.5, "missing": 0.0})
+        errors, epochs = [], 0
+        for seed in SEEDS:
+            flight = exported(folder, options, None, DURATION_S, seed)
+            found = rtklib.single_point(folder, flight.rover, flight.nav, "GREC", 10.0)
+            errors.append(flight.errors((s.t_ns for s in found), (s.position for s in found)))
+            epochs += len(flight.observed)
+        rms = np.sqrt(np.mean(np.square(np.concatenate(errors)), axis=0))
+        seconds = np.median([correlation_time(e[:, axis], 2.0) for e in errors for axis in range(3)])
+        given = sum(map(len, errors)) / epochs
+        print(f"| {name} | {np.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {seconds:.0f} | {given:.1%} |", flush=True)
+
+
+def carrier_phases(folder):
+    """RTKLIB's carrier-phase solutions against the base."""
+    print("\n| carrier phase against the base | fixed | error of fixed, median, m | 95 % | most | target |")
+    print("|---|---|---|---|---|---|")
+    base = GnssOptions.base()
+    quiet = replace(PERFECT, code=base.code, phase=base.phase)
+    for name, options, ground in (
+        ("no errors", PERFECT, PERFECT),
+        ("noise alone", quiet, quiet),
+        ("all errors", DEFAULT, base),
+    ):
+        errors, epochs = [], 0
+        for seed in SEEDS:
+            flight = exported(
+                folder, replace(options, rate_hz=1.0, missing=0.0), replace(ground, rate_hz=1.0), DURATION_S / 2, seed
+            )
+            found = rtklib.kinematic(folder, flight.rover, flight.base, flight.nav, BASE_ECEF)
+            fixed = [s for s in found if s.fixed]
+            offset = flight.errors((s.t_ns for s in fixed), (s.position for s in fixed))
+            errors.append(np.linalg.norm(offset, axis=1))
+            epochs += len(flight.observed)
+        apart = np.concatenate(errors)
+        median, most95, most = np.percentile(apart, (50, 95, 100))
+        print(f"| {name} | {len(apart) / epochs:.0%} | {median:.4f} | {most95:.4f} | {most:.4f} | ≤ 0.03 |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,495 @@
+"""The simulated GNSS: exact ranges, errors with switches, bytes for the driver, and RTKLIB as judge of it all."""
+
+from __future__ import annotations
+
+import hashlib
+import tracemalloc
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rtklib
+from gnss_scene import (
+    BASE_ECEF,
+    DATUM,
+    T_ECEF_WORLD,
+    broadcast,
+    circling,
+    correlation_time,
+    exported,
+    longest_gap,
+    rover,
+    sky,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from air.gnss.ephemerides import Ephemerides
+from air.gnss.gnss_time import SECOND_NS, from_week, to_week
+from air.gnss.orbit import EARTH_RATE, states_at
+from air.gnss.positioning import PointPosition, find_position
+from air.gnss.settings import PositioningSettings
+from air.gnss.signals import LIGHT
+from air.sensors.gnss_ublox import UbloxReceiver
+from air.sources.simulated.antenna import carried_antenna
+from air.sources.simulated.constellation import constellation
+from air.sources.simulated.gnss_options import GnssOptions, intervals
+from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.multirotor import fly
+from air.sources.simulated.receiver_clock import ReceiverClock
+from air.sources.simulated.survey import START_NS
+from air.sources.source import open_source
+from common.arrays import F64, Bool
+from common.config import parse
+from common.errors import ConfigError, SourceError
+from common.geo import ecef_to_geodetic, geodetic_to_enu
+from common.measurements import (
+    FixKind,
+    GlonassEphemeris,
+    GnssEpoch,
+    Ionosphere,
+    KeplerEphemeris,
+    Measurement,
+    ReceiverSolution,
+)
+
+PERFECT = GnssOptions.perfect()
+DEFAULT = GnssOptions()
+
+
+def decoded(packets: Iterator[tuple[float, bytes]]) -> list[Measurement]:
+    """What the driver makes of a receiver's bytes."""
+    driver = UbloxReceiver()
+    found = [measurement for _, data in packets for measurement in driver.feed(data, 0)]
+    assert driver.counts.dropped_bytes == driver.counts.refused == 0
+    return found
+
+
+def solutions(measurements: list[Measurement]) -> list[ReceiverSolution]:
+    return [m for m in measurements if isinstance(m, ReceiverSolution)]
+
+
+# Orbits and ranges
+
+
+def test_the_range_is_that_of_light_between_two_moving_points() -> None:
+    """The oracle solves for the moment of transmission in inertial space, with orbits computed at that very moment."""
+    above = sky(PERFECT)
+    t_s = np.array([0.0, 7.3, 33.37, 119.99, 1800.5])
+    places, velocities = circling(t_s)
+    geometry = above.geometry(t_s, places, velocities)
+    references = above.constellation.reference
+    for n, t in enumerate(t_s.tolist()):
+        tau = np.full(len(references), 0.07)
+        for _ in range(6):
+            p = states_at(references, START_NS, t - tau).position
+            inertial = np.stack([turn(v, -EARTH_RATE * x) for v, x in zip(p, tau, strict=True)])
+            distance = np.linalg.norm(inertial - places[n], axis=1)
+            tau = distance / LIGHT
+        # The offset of states_at is a float of s: at 8 km/s its rounding is below a nanometre.
+        np.testing.assert_allclose(geometry.distance[n], distance, rtol=0, atol=1e-4)
+
+
+def turn(v: F64, angle: float) -> F64:
+    """A vector of ECEF after the earth turned by an angle, seen from the frame as it was."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]])
+
+
+def test_the_rates_are_the_derivatives_of_the_ranges_and_clocks() -> None:
+    above = sky(replace(DEFAULT, fault=2, fault_start=10.0, fault_ramp=0.5))
+    t_s, h = np.array([3.0, 15.0, 61.7, 600.0]), 0.05
+    before, now, after = (above.geometry(t, *circling(t)) for t in (t_s - h, t_s, t_s + h))
+    # Central differences are off by h²/6 times the third derivative (the circle's 0.03 m/s³), and rounding.
+    np.testing.assert_allclose((after.distance - before.distance) / (2 * h), now.rate, rtol=0, atol=1e-4)
+    np.testing.assert_allclose((after.clock - before.clock) / (2 * h), now.clock_rate, rtol=0, atol=1e-4)
+
+
+def test_the_nominal_sky_looks_like_the_real_one() -> None:
+    above = sky(PERFECT)
+    seen = above.air(0.0, BASE_ECEF).elevation > np.radians(10)
+    count = Counter(name[0] for name, up in zip(above.satellites, seen, strict=True) if up)
+    assert all(7 <= count[system] <= 13 for system in "GE")
+    assert 5 <= count["R"] <= 10
+    assert 12 <= count["C"] <= 25  # over East Asia
+    states = states_at(above.constellation.reference, START_NS, np.zeros(len(above.satellites)))
+    longitude = dict(zip(above.satellites, ecef_to_geodetic(states.position), strict=True))
+    for name, expected in {"C01": 140.0, "C02": 84.0, "C03": 110.5, "C04": 160.0, "C05": 58.75}.items():
+        assert abs(longitude[name][0]) < 0.5
+        assert longitude[name][1] == pytest.approx(expected, abs=0.5)
+        assert longitude[name][2] == pytest.approx(35_786e3, abs=50e3)
+
+
+def test_new_issues_describe_the_orbits_that_are_flown() -> None:
+    """Their errors are those of rounding: half a metre for GLONASS, some centimetres for the others."""
+    found = constellation(DEFAULT, START_NS, 1)
+    most = {"G": 0.08, "E": 0.06, "C": 0.08, "R": 1.5}
+    changed = Counter[str]()
+    for after_s in range(0, 1801, 200):
+        t_ns = START_NS + after_s * SECOND_NS
+        issues = [found.issue(name, t_ns) for name in found.satellites]
+        told, flown = (states_at(e, t_ns, np.zeros(len(issues))) for e in (issues, found.reference))
+        error = np.linalg.norm(told.position - flown.position, axis=1) + LIGHT * np.abs(told.clock - flown.clock)
+        for name, value, issue, first in zip(found.satellites, error, issues, found.reference, strict=True):
+            assert value <= most[name[0]], name
+            changed[name[0]] += issue != first
+            assert issue.toe_ns != t_ns or name[0] != "E"
+    assert all(changed[system] for system in "GER")
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**31 - 1), st.integers(0, 10**6))
+def test_a_flight_may_start_at_any_time(seed: int, minutes: int) -> None:
+    start_ns = START_NS + minutes * 60 * SECOND_NS
+    found = constellation(DEFAULT, start_ns, seed)
+    assert len(found.satellites) == 31 + 24 + 24 + 9 + 5 + 24
+    radius = np.linalg.norm(states_at(found.reference, start_ns, np.zeros(len(found.satellites))).position, axis=1)
+    assert radius.min() > 25e6
+    assert radius.max() < 43e6
+
+
+def test_the_satellites_of_a_navigation_file_fly(real_data: Callable[[str], Path]) -> None:
+    path = real_data("gnss") / "matrtklib_static" / "base.nav"
+    options = replace(PERFECT, nav=str(path), rate_hz=1.0)
+    observed = list(rover(options, 20.0).observations())
+    filed = {m.satellite for m in open_source(f"rinex:{path}") if isinstance(m, KeplerEphemeris | GlonassEphemeris)}
+    assert set(observed[-1].epoch.satellites) <= filed
+    known = Ephemerides(broadcast(sky(options), 20.0))
+    found = find_position(observed[-1].epoch, known, PositioningSettings())
+    assert isinstance(found, PointPosition)
+    assert np.linalg.norm(found.position - circling(np.array([observed[-1].t_s]))[0][0]) < 0.05
+
+
+def test_a_file_without_orbits_is_refused(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.nav"
+    empty.write_text(f"{'     3.04           N: GNSS NAV DATA    M: MIXED':<60}RINEX VERSION / TYPE\n")
+    with pytest.raises(SourceError, match="no usable ephemeris"):
+        constellation(replace(DEFAULT, nav=str(empty)), START_NS, 1)
+    with pytest.raises(SourceError, match="cannot be read"):
+        constellation(replace(DEFAULT, nav=str(tmp_path / "none")), START_NS, 1)
+
+
+# Measurements
+
+
+def test_doppler_is_the_derivative_of_the_carrier() -> None:
+    """Without noise, central differences over 0.2 s; bytes round Doppler to 0.05 mm/s (32 bits of up to 5 kHz)."""
+    options = replace(PERFECT, clock_drift_ppm=0.5)
+    epochs = [o.epoch for o in rover(options, 30.0).observations()]
+    checked = 0
+    for before, now, after in zip(epochs, epochs[1:], epochs[2:], strict=False):
+        if not before.satellites == now.satellites == after.satellites:
+            continue
+        rate_hz = (after.carrier_phase - before.carrier_phase) / ((after.t_ns - before.t_ns) / SECOND_NS)
+        error = (rate_hz + now.doppler) * LIGHT / 1575.42e6
+        assert np.nanmax(np.abs(error)) < 1e-3
+        checked += np.isfinite(error).sum()
+    assert checked > 10_000
+
+
+def test_code_minus_carrier_is_constant_but_for_twice_the_ionosphere() -> None:
+    epochs = [o.epoch for o in rover(replace(PERFECT, ionosphere=0.0), 20.0).observations()]
+    key = ("G", "1C")
+    held: dict[str, list[float]] = {}
+    for epoch in epochs:
+        for i, (satellite, signal) in enumerate(zip(epoch.satellites, epoch.signals, strict=True)):
+            if (satellite[0], signal) == key:
+                metres = epoch.carrier_phase[i] * LIGHT / 1575.42e6
+                held.setdefault(satellite, []).append(epoch.pseudorange[i] - metres)
+    assert len(held) > 5
+    assert max(np.ptp(values) for values in held.values()) < 1e-5
+
+
+def test_ambiguities_are_whole_numbers_that_only_slips_change() -> None:
+    observed = list(rover(replace(DEFAULT, slips=400.0), 60.0).observations())
+    last: dict[tuple[str, str], tuple[float, float]] = {}
+    slips = 0
+    for o in observed:
+        e = o.epoch
+        for i, key in enumerate(zip(e.satellites, e.signals, strict=True)):
+            if np.isnan(e.carrier_phase[i]):
+                last.pop(key, None)
+                continue
+            whole = o.ambiguity[i] if not e.half_cycle[i] else np.floor(o.ambiguity[i])
+            assert whole == round(whole)
+            if key in last and last[key][0] != whole:
+                slips += 1
+                assert e.lock_s[i] < last[key][1] + 0.1
+                assert e.lock_s[i] < 1.0
+            last[key] = whole, e.lock_s[i]
+    assert slips > 5
+
+
+def test_the_clock_stays_within_half_a_millisecond_and_says_when_it_jumps() -> None:
+    options = replace(PERFECT, rate_hz=2.0, clock=1.0, clock_drift_ppm=10.0, systems="G")
+    observed = list(rover(options, 300.0).observations())
+    assert max(abs(o.clock) for o in observed) <= 0.5e-3 + 1e-5
+    jumps = [b.clock - a.clock for a, b in pairwise(observed) if b.epoch.clock_reset]
+    assert jumps
+    assert all(abs(abs(jump) - 1e-3) < 1e-4 for jump in jumps)
+    tags = [o.epoch.t_ns - START_NS - round(o.t_s * 1e9) - round(o.clock * 1e9) for o in observed]
+    assert max(map(abs, tags)) <= 2  # the tag is the true time and the clock's error, to the rounding of both
+
+
+def test_a_clock_is_a_smooth_function_of_time() -> None:
+    clock = ReceiverClock(1.0, 0.5, 1, 54)
+    t_s = np.linspace(0.0, 300.0, 3001)
+    bias, drift = clock.at(t_s)
+    np.testing.assert_allclose(np.diff(bias) / 0.1, (drift[1:] + drift[:-1]) / 2, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(ReceiverClock(1.0, 0.5, 1, 54).at(t_s[::-1])[0][::-1], bias)
+    np.testing.assert_allclose(clock.time_of(t_s + bias), t_s, rtol=0, atol=1e-12)
+    assert not ReceiverClock(0.0, 0.0, 1, 54).at(t_s)[0].any()
+
+
+@pytest.mark.parametrize(
+    ("field", "least"), [("multipath", 0.5), ("orbit", 0.1), ("satellite_clock", 0.1), ("ionosphere_residual", 0.2)]
+)
+def test_every_error_has_its_switch(field: str, least: float) -> None:
+    options = replace(PERFECT, rate_hz=1.0)
+    clean, spoilt = (
+        list(rover(o, 2.0).observations())[1].epoch
+        for o in (options, replace(options, **{field: getattr(DEFAULT, field)}))
+    )
+    assert clean.satellites == spoilt.satellites
+    assert np.std(clean.pseudorange - spoilt.pseudorange) > least
+
+
+def test_noise_is_as_large_as_the_receiver_says() -> None:
+    """In units of the receiver's own sigma, which it rounds to powers of two; GLONASS is half as noisy again."""
+    noisy = replace(PERFECT, code=0.3)
+    pairs = zip(rover(PERFECT, 20.0).observations(), rover(noisy, 20.0).observations(), strict=True)
+    z = np.concatenate([(a.epoch.pseudorange - b.epoch.pseudorange) / b.epoch.sigma_pseudorange for a, b in pairs])
+    assert 0.7 < z.std() < 1.6
+    assert np.abs(z).max() < 10.0
+
+
+def test_multipath_stays_for_a_minute() -> None:
+    options = replace(PERFECT, multipath=2.0, rate_hz=1.0, systems="C")
+    observed = list(rover(options, 900.0, antenna=circling).observations())
+    times = []
+    for name in ("C01", "C03", "C04"):
+        values = [o.multipath[o.epoch.satellites.index(name)] for o in observed]
+        times.append(correlation_time(np.array(values), 1.0))
+    assert 25.0 < np.mean(times) < 110.0  # an estimate of 60 s from three stretches of fifteen minutes
+
+
+# What is received
+
+
+def test_nothing_is_received_in_an_outage_and_all_comes_back() -> None:
+    observed = list(rover(replace(DEFAULT, outage="10-20"), 30.0).observations())
+    count = {round(o.t_s, 1): len(o.epoch.satellites) for o in observed}
+    assert all(n == 0 for t, n in count.items() if 10.05 < t < 19.95)
+    assert all(n > 50 for t, n in count.items() if t < 9.95 or t > 22)
+    back = next(o.epoch for o in observed if o.t_s > 24)
+    assert np.nanmax(back.lock_s) < 5.0
+
+
+def test_jamming_makes_signals_weak_then_loses_them() -> None:
+    observed = list(rover(replace(DEFAULT, jamming="5-45", jamming_db=30.0, rate_hz=2.0), 60.0).observations())
+    at = {round(o.t_s): o.epoch for o in observed}
+    assert np.median(at[10].cn0) < np.median(at[2].cn0) - 5
+    assert len(at[25].satellites) < 0.2 * len(at[2].satellites)
+    assert len(at[58].satellites) > 0.9 * len(at[2].satellites)
+
+
+def test_buildings_hide_satellites() -> None:
+    asked = []
+
+    def wall(p_world: F64, direction: F64) -> Bool:
+        asked.append(p_world)
+        return np.asarray(direction[:, 0] > 0)
+
+    observed = list(rover(replace(DEFAULT, rate_hz=1.0), 5.0, blocked=wall).observations())
+    assert all((np.sin(o.azimuth) <= 1e-3).all() and len(o.azimuth) > 10 for o in observed)
+    np.testing.assert_allclose(asked[0], [30.0, 0.0, 40.0], atol=1e-6)
+
+
+def test_faulty_satellites_do_not_say_so_and_are_found_out() -> None:
+    options = replace(PERFECT, rate_hz=1.0, fault=2, fault_bias=50.0, fault_start=5.0, systems="GE")
+    above = sky(options)
+    names = {name for name, bad in zip(above.satellites, above.faulty, strict=True) if bad}
+    assert len(names) == 2
+    known = Ephemerides(broadcast(above, 10.0))
+    before, after = (o.epoch for o in rover(options, 10.0).observations() if round(o.t_s) in (4, 8))
+    found = find_position(after, known, PositioningSettings())
+    assert isinstance(found, PointPosition)
+    assert {name for name, why in found.rejected.items() if "residual" in why} == names
+    assert isinstance(find_position(before, known, PositioningSettings()), PointPosition)
+
+
+def test_epochs_come_at_7_to_8_hz_as_in_the_paper() -> None:
+    times = [o.t_s for o in rover(replace(DEFAULT, systems="G"), 120.0).observations()]
+    assert 7.0 < len(times) / 120 < 8.0
+    assert 0.25 < longest_gap(times) < 1.5
+    assert len(list(rover(replace(DEFAULT, systems="G", missing=0.0), 10.0).observations())) in (100, 101)
+
+
+# Bytes
+
+
+def test_the_driver_gives_back_the_same_measurements_and_ephemerides() -> None:
+    receiver = rover(replace(DEFAULT, missing=0.5), 65.0)
+    packets = list(receiver.packets())
+    times = [t for t, _ in packets]
+    assert times == sorted(times)
+    found = decoded(iter(packets))
+    epochs = [m for m in found if isinstance(m, GnssEpoch)]
+    for epoch, told in zip(epochs, (o.epoch for o in receiver.observations()), strict=True):
+        for field in fields(GnssEpoch):
+            ours, theirs = getattr(told, field.name), getattr(epoch, field.name)
+            if isinstance(ours, np.ndarray):
+                np.testing.assert_array_equal(theirs, ours, err_msg=field.name)
+            else:
+                assert theirs == ours
+    assert [s.kind for s in solutions(found)] == [FixKind.FIX_3D] * len(epochs)
+    above = sky(DEFAULT)
+    sent = {(e.satellite, e.toe_ns): e for e in broadcast(above, 65.0) if not isinstance(e, Ionosphere)}
+    heard = [m for m in found if isinstance(m, KeplerEphemeris | GlonassEphemeris)]
+    assert {m.satellite[0] for m in heard} == set("GREC")
+    assert {m.satellite for m in heard} >= set(epochs[-1].satellites) - {
+        name for name in epochs[-1].satellites if name not in epochs[0].satellites
+    }
+    for message in heard:
+        assert message == replace(sent[message.satellite, message.toe_ns], t_ns=message.t_ns)
+    (model,) = {replace(m, t_ns=0) for m in found if isinstance(m, Ionosphere)}
+    assert (model.alpha, model.beta) == (above.constellation.ionosphere.alpha, above.constellation.ionosphere.beta)
+
+
+def test_the_ionosphere_of_gps_comes_with_its_page() -> None:
+    """Page 18 of 25, each 30 s: from 8 min 30 s after a multiple of 12 min 30 s of the week."""
+    week, tow_s = to_week(START_NS)
+    start_ns = from_week(week, tow_s // 750 * 750 + 500)
+    receiver = rover(replace(DEFAULT, systems="G", rate_hz=1.0, missing=0.0), 45.0, start_ns=start_ns)
+    assert [m.system for m in decoded(receiver.packets()) if isinstance(m, Ionosphere)] == ["G"]
+
+
+def test_the_receivers_own_solution_follows_the_flight() -> None:
+    trajectory, _ = fly(FlightOptions(start="air"), 1, 30.0, np.zeros(3))
+    arm = np.array([-0.12, 0.02, 0.22])
+    antenna = carried_antenna(trajectory, arm, DATUM)
+    packets = list(rover(PERFECT, 30.0, antenna=antenna).packets())
+    errors, speed_errors = [], []
+    for solution in solutions(decoded(iter(packets)))[20:]:
+        t_s = np.array([(solution.t_ns - START_NS) / SECOND_NS])
+        p_world = geodetic_to_enu(DATUM, solution.latitude_deg, solution.longitude_deg, solution.height)
+        p, v = antenna(t_s)
+        errors.append(p_world - T_ECEF_WORLD.inverse().apply(p[0]))
+        speed_errors.append(solution.v_enu - v[0] @ T_ECEF_WORLD.R)
+    # Without errors of the signals what is left are the filter's lag in turns and gusts, and millimetres of NAV-PVT.
+    assert np.sqrt(np.mean(np.square(errors), axis=0)).max() < 0.15
+    assert np.sqrt(np.mean(np.square(speed_errors), axis=0)).max() < 0.3
+
+
+def test_an_antenna_moves_as_the_body_turns() -> None:
+    trajectory, _ = fly(FlightOptions(), 1, 60.0, np.zeros(3))
+    antenna = carried_antenna(trajectory, np.array([0.5, -0.3, 0.2]), DATUM)
+    t_s, h = np.arange(10.0, 50.0, 0.37), 1e-3
+    rate = (antenna(t_s + h)[0] - antenna(t_s - h)[0]) / (2 * h)
+    np.testing.assert_allclose(rate, antenna(t_s)[1], rtol=0, atol=1e-5)
+
+
+def test_a_cold_receiver_finds_satellites_and_its_position_within_a_minute_or_so() -> None:
+    found = decoded(rover(replace(DEFAULT, cold=1, rate_hz=1.0, missing=0.0), 100.0).packets())
+    epochs = [m for m in found if isinstance(m, GnssEpoch)]
+    assert not epochs[5].satellites
+    assert len(epochs[-1].satellites) > 50
+    kinds = [s.kind for s in solutions(found)]
+    assert kinds[20] is FixKind.NONE
+    first = kinds.index(FixKind.FIX_3D)
+    assert 40 < first < 95
+    assert set(kinds[first:]) == {FixKind.FIX_3D}
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    def digest(seed: int) -> str:
+        return hashlib.sha256(b"".join(data for _, data in rover(DEFAULT, 12.0, seed).packets())).hexdigest()
+
+    assert digest(1) == digest(1) != digest(2)
+    receiver = rover(DEFAULT, 5.0)
+    assert list(receiver.packets()) == list(receiver.packets())
+
+
+def test_a_long_flight_takes_little_memory() -> None:
+    packets = rover(replace(DEFAULT, rate_hz=2.0, missing=0.0, systems="GE"), 200.0).packets()
+    for _ in range(200):
+        next(packets)
+    tracemalloc.start()
+    for _ in packets:
+        pass
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2e6  # an epoch alone takes 10 kB: they are not kept
+
+
+# Options
+
+
+def test_impossible_options_are_named() -> None:
+    with pytest.raises(SourceError, match=r"'outage' is '60'.*60-180"):
+        intervals("60", "outage")
+    with pytest.raises(SourceError, match="'jamming'"):
+        rover(replace(DEFAULT, jamming="9-5"), 10.0)
+    with pytest.raises(ConfigError, match="multipat"):
+        parse({"multipat": 0.0}, GnssOptions)
+    with pytest.raises(ConfigError, match="missing"):
+        parse({"missing": 2.0}, GnssOptions)
+    assert intervals("1-2,3.5-4", "outage") == ((1.0, 2.0), (3.5, 4.0))
+
+
+# RTKLIB
+
+
+def test_without_errors_rtklib_is_right_to_centimetres(tmp_path: Path) -> None:
+    options = replace(PERFECT, rate_hz=0.2)
+    flight = exported(tmp_path, options, None, 300.0)
+    found = rtklib.single_point(tmp_path, flight.rover, flight.nav, "GREC", 10.0)
+    errors = flight.errors((s.t_ns for s in found), (s.position for s in found))
+    assert len(found) == len(flight.observed)
+    # New issues are rounded anew, GLONASS's by decimetres; RTKLIB weighs them low.
+    assert np.abs(errors).max() < 0.1
+
+
+def test_with_errors_rtklib_finds_a_receiver_of_the_metre_class(tmp_path: Path) -> None:
+    options = replace(DEFAULT, rate_hz=0.25, missing=0.0)
+    errors = []
+    for seed in (1, 2):
+        flight = exported(tmp_path, options, None, 900.0, seed)
+        found = rtklib.single_point(tmp_path, flight.rover, flight.nav, "GREC", 10.0)
+        errors.append(flight.errors((s.t_ns for s in found), (s.position for s in found)))
+        assert len(found) > 0.98 * len(flight.observed)
+    rms = np.sqrt(np.mean(np.square(np.concatenate(errors)), axis=0))
+    # A quarter of an hour holds some fifteen independent values of each axis: the deviation is known to a fifth.
+    assert 1.0 < np.hypot(rms[0], rms[1]) < 2.2
+    assert 1.2 < rms[2] < 4.5
+    times = [correlation_time(e[:, axis], 4.0) for e in errors for axis in range(3)]
+    assert 20.0 < np.median(times) < 250.0
+
+
+def test_rtklib_fixes_carrier_phases_and_agrees_with_truth_within_3_cm(tmp_path: Path) -> None:
+    options = replace(DEFAULT, rate_hz=1.0, missing=0.0)
+    flight = exported(tmp_path, options, GnssOptions.base(), 300.0)
+    found = [s for s in rtklib.kinematic(tmp_path, flight.rover, flight.base, flight.nav, BASE_ECEF) if s.fixed]
+    assert len(found) > 0.5 * len(flight.observed)
+    errors = flight.errors((s.t_ns for s in found), (s.position for s in found))
+    assert np.percentile(np.linalg.norm(errors, axis=1), 99) < 0.03
+
+
+def test_exported_files_hold_what_was_measured(tmp_path: Path) -> None:
+    flight = exported(tmp_path, replace(DEFAULT, rate_hz=1.0), None, 30.0)
+    items = list(open_source(f"rinex:{flight.rover},{flight.nav}"))
+    epochs = [m for m in items if isinstance(m, GnssEpoch)]
+    for read, told in zip(epochs, (o.epoch for o in flight.observed), strict=True):
+        order = sorted(range(len(told.satellites)), key=lambda i: (told.satellites[i], told.signals[i]))
+        names = [(told.satellites[i], told.signals[i]) for i in order]
+        index = [list(zip(read.satellites, read.signals, strict=True)).index(name) for name in names]
+        assert abs(read.t_ns - told.t_ns) <= 100
+        for field, digit in (("pseudorange", 1e-3), ("carrier_phase", 1e-3), ("doppler", 1e-3)):
+            np.testing.assert_allclose(
+                getattr(read, field)[index], getattr(told, field)[order], rtol=0, atol=0.51 * digit
+            )
+    assert len([m for m in items if isinstance(m, KeplerEphemeris | GlonassEphemeris)]) > 100
