@@ -49,8 +49,9 @@ class Telemetry:
     start_ns: int = 0
 
     def of(self, key: str, columns: int) -> list[tuple[Payload, Series]]:
-        """The series of one key with so many columns, in the order of the file."""
-        return [(p, s) for p in self.payloads for s in p.series if s.key == key and s.values.shape[1] == columns]
+        """The series of one key that hold samples of so many columns, in the order of the file."""
+        series = ((p, s) for p in self.payloads for s in p.series if s.key == key and len(s.values))
+        return [(p, s) for p, s in series if s.values.shape[1] == columns]
 
     def rows(self, key: str, columns: int) -> list[F64]:
         """The samples (columns,) of these series."""
@@ -64,7 +65,7 @@ def sample_times(series: list[tuple[Payload, Series]]) -> F64:
     samples are spread evenly over their payload.
     """
     counts = [len(s.values) for _, s in series]
-    spread = [p.start_s + p.duration_s * np.arange(n) / max(n, 1) for (p, _), n in zip(series, counts, strict=True)]
+    spread = [p.start_s + p.duration_s * np.arange(n) / n for (p, _), n in zip(series, counts, strict=True)]
     evenly = np.concatenate([np.zeros(0), *spread])
     ends_s = np.array([p.start_s + p.duration_s for p, _ in series])
     totals = np.array([_number(s, "TSMP") for _, s in series])
@@ -133,9 +134,9 @@ def utc_of_video(telemetry: Telemetry) -> list[float]:
     fixed = [(p, s) for p, s in telemetry.of("GPS5", 5) if _number(s, "GPSF") >= 2]
     starts_s = [_unix_s(s.texts.get("GPSU", "")) - p.start_s for p, s in fixed]
     for payload, series in telemetry.of("GPS9", 9):
-        row = series.values[:1]
-        if len(row) and row[0, 8] >= 2:
-            starts_s.append(float(_Y2K_S + row[0, 5] * 86_400 + row[0, 6] - payload.start_s))
+        row = series.values[0]
+        if row[8] >= 2:
+            starts_s.append(float(_Y2K_S + row[5] * 86_400 + row[6] - payload.start_s))
     return starts_s
 
 

@@ -107,11 +107,8 @@ def _read_stream(device: str, data: bytes, damage: Damage) -> Series | None:
         return None
     *described, samples = items
     texts = {item.key: _text(item) for item in described if chr(item.type) in _TEXT}
-    numbers = {
-        item.key: _table(item, chr(item.type) * _columns(item)).ravel()
-        for item in described
-        if chr(item.type) in _NUMBERS
-    }
+    tables = {item.key: _table(item, chr(item.type) * _columns(item)).ravel() for item in described}
+    numbers = {key: values for key, values in tables.items() if len(values)}
     values = _samples(samples, texts.get("TYPE", ""), numbers.get("SCAL", np.ones(1)))
     if values is None:
         damage.refused += 1
