@@ -28,7 +28,7 @@ AWAY_S = 3.0
 """Pulled out for so long, attempts to open have become as rare as they get."""
 FIGURES = (
     Figure("CPU of `luojia-air run`", "%", 1),
-    Figure("bytes of the IMU that reached the bus", "%", 1, least=0.999),
+    Figure("bytes of the IMU that reached the bus, but for those on their way", "%", 1, least=0.99),
     Figure("read again after it was put in, median", "s", 2),
     Figure("read again after it was put in, worst", "s", 2, most=2.0),
 )
