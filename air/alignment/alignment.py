@@ -295,17 +295,21 @@ class Alignment:
             self._block.priors[i] = self._prior(entry.photo)
 
     def _adjust_around(self, photo: int) -> None:
-        """Adjust a new photo and those that share most with it, held by the next ones."""
+        """Adjust a new photo and those that share most with it, held by the others that see what these see."""
         block = self._block
-        others = [i for i in sorted(block.poses) if i != photo]
-        seen = block.tracks.observations(block.seen_points(photo)[1], others)
-        sharing, shared = np.unique(seen.photo, return_counts=True)
-        order = sharing[np.argsort(-shared, kind="stable")].tolist()
-        free = [photo, *order[:LOCAL_FREE]]
-        fixed = order[LOCAL_FREE : LOCAL_FREE + LOCAL_FIXED]
+        free = [photo, *self._sharing([photo])[:LOCAL_FREE]]
+        fixed = self._sharing(free)[:LOCAL_FIXED]
         block.adjust(free, fixed, calibrate=False, per_photo=self.settings.observations_per_photo // 2, final=False)
         block.prune(free)
         block.triangulate(free)
+
+    def _sharing(self, photos: list[int]) -> list[int]:
+        """The placed photos that see points of some others, those that see most of them first."""
+        block = self._block
+        others = [i for i in sorted(block.poses) if i not in photos]
+        seen = block.tracks.observations(block.tracks_of(photos), others)
+        sharing, shared = np.unique(seen.photo, return_counts=True)
+        return [int(i) for i in sharing[np.argsort(-shared, kind="stable")]]
 
     def _adjust_if_due(self) -> None:
         if self.placed >= max(self._adjusted * self.settings.growth, self._adjusted + 1):
