@@ -37,6 +37,14 @@ def circling(t_s: F64) -> tuple[F64, F64]:
     return T_ECEF_WORLD.apply(p), v @ T_ECEF_WORLD.R.T
 
 
+def circling_low(t_s: F64) -> tuple[F64, F64]:
+    """The same circles as high as the base, so that both antennas have the same air above them."""
+    p, v = circling(t_s)
+    p_world, v_world = T_ECEF_WORLD.inverse().apply(p), v @ T_ECEF_WORLD.R
+    p_world[:, 2], v_world[:, 2] = BASE_WORLD[2], 0.0
+    return T_ECEF_WORLD.apply(p_world), v_world @ T_ECEF_WORLD.R.T
+
+
 def sky(options: GnssOptions, seed: int = 1, start_ns: int = START_NS) -> Sky:
     return Sky(constellation(options, start_ns, seed), options, DATUM, start_ns, seed)
 
@@ -60,19 +68,25 @@ class Exported:
     base: Path
     nav: Path
     observed: list[Observed]
+    antenna: Antenna
 
     def errors(self, t_ns: Iterable[int], positions: Iterable[F64]) -> F64:
         """East, north, up (N, 3) m of positions in ECEF against the truth at GPST (RTKLIB takes its clock off)."""
-        truth, _ = circling((np.array(list(t_ns)) - START_NS) / 1e9)
+        truth, _ = self.antenna((np.array(list(t_ns)) - START_NS) / 1e9)
         return (np.array(list(positions)) - truth) @ T_ECEF_WORLD.R
 
 
 def exported(
-    folder: Path, options: GnssOptions, base: GnssOptions | None, duration_s: float, seed: int = 1
+    folder: Path,
+    options: GnssOptions,
+    base: GnssOptions | None,
+    duration_s: float,
+    seed: int = 1,
+    antenna: Antenna = circling,
 ) -> Exported:
     """A flight, with a base station or without, as RINEX files."""
     above = sky(options, seed)
-    flying = SimulatedReceiver("gnss", circling, above, options, seed, duration_s)
+    flying = SimulatedReceiver("gnss", antenna, above, options, seed, duration_s)
     observed = list(flying.observations())
     epochs = [o.epoch for o in observed]
     if base is not None:
@@ -80,7 +94,7 @@ def exported(
         standing = SimulatedReceiver("base", ground, above, base, seed, duration_s, BASE_STATION)
         epochs += [o.epoch for o in standing.observations()]
     export_rinex([*epochs, *broadcast(above, duration_s)], folder)
-    return Exported(folder / "gnss.obs", folder / "base.obs", folder / "broadcast.nav", observed)
+    return Exported(folder / "gnss.obs", folder / "base.obs", folder / "broadcast.nav", observed, antenna)
 
 
 def broadcast(above: Sky, duration_s: float) -> list[Ephemeris | Ionosphere]:

@@ -19,6 +19,7 @@ from gnss_scene import (
     T_ECEF_WORLD,
     broadcast,
     circling,
+    circling_low,
     correlation_time,
     exported,
     longest_gap,
@@ -434,6 +435,8 @@ def test_impossible_options_are_named() -> None:
         intervals("60", "outage")
     with pytest.raises(SourceError, match="'jamming'"):
         rover(replace(DEFAULT, jamming="9-5"), 10.0)
+    with pytest.raises(SourceError, match=r"'systems' is 'GX', must be some of GREC"):
+        sky(replace(DEFAULT, systems="GX"))
     with pytest.raises(ConfigError, match="multipat"):
         parse({"multipat": 0.0}, GnssOptions)
     with pytest.raises(ConfigError, match="missing"):
@@ -468,6 +471,16 @@ def test_with_errors_rtklib_finds_a_receiver_of_the_metre_class(tmp_path: Path) 
     assert 1.2 < rms[2] < 4.5
     times = [correlation_time(e[:, axis], 4.0) for e in errors for axis in range(3)]
     assert 20.0 < np.median(times) < 250.0
+
+
+def test_without_errors_rtklibs_fixed_positions_are_right_to_a_millimetre(tmp_path: Path) -> None:
+    """Files round phases to a thousandth of a cycle, 0.2 mm."""
+    options = replace(PERFECT, rate_hz=1.0)
+    flight = exported(tmp_path, options, options, 60.0, antenna=circling_low)
+    found = rtklib.kinematic(tmp_path, flight.rover, flight.base, flight.nav, BASE_ECEF)
+    assert len(found) == len(flight.observed)
+    assert all(s.fixed for s in found)
+    assert np.abs(flight.errors((s.t_ns for s in found), (s.position for s in found))).max() < 1e-3
 
 
 def test_rtklib_fixes_carrier_phases_and_agrees_with_truth_within_3_cm(tmp_path: Path) -> None:

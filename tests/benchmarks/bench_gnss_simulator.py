@@ -2,7 +2,8 @@
 
 A rover flies circles at 3 m/s, 40 m up, some 190 m from a base station. RTKLIB's rnx2rtkp gets the exported RINEX:
 single points with one band, broadcast ionosphere and Saastamoinen, elevation mask 10°, all systems; carrier phase
-(GPS, Galileo, GLONASS in two bands, mask 15°) epoch by epoch, without holding ambiguities.
+(GPS, Galileo, GLONASS in two bands, mask 15°) epoch by epoch, without holding ambiguities. Of the wet delay between
+rover and base, 40 m apart in height, RTKLIB knows nothing: 6 mm.
 
 python tests/benchmarks/bench_gnss_simulator.py
 """
@@ -20,7 +21,7 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import rtklib
-from gnss_scene import BASE_ECEF, correlation_time, exported, rover
+from gnss_scene import BASE_ECEF, circling, circling_low, correlation_time, exported, rover
 
 from air.sources.simulated.gnss_options import GnssOptions
 
@@ -87,16 +88,16 @@ def carrier_phases(folder):
     print("|---|---|---|---|---|---|")
     base = GnssOptions.base()
     quiet = replace(PERFECT, code=base.code, phase=base.phase)
-    for name, options, ground in (
-        ("no errors", PERFECT, PERFECT),
-        ("noise alone", quiet, quiet),
-        ("all errors", DEFAULT, base),
+    for name, options, ground, antenna in (
+        ("no errors, at the base's height", PERFECT, PERFECT, circling_low),
+        ("no errors", PERFECT, PERFECT, circling),
+        ("noise alone", quiet, quiet, circling),
+        ("all errors", DEFAULT, base, circling),
     ):
         errors, epochs = [], 0
         for seed in SEEDS:
-            flight = exported(
-                folder, replace(options, rate_hz=1.0, missing=0.0), replace(ground, rate_hz=1.0), DURATION_S / 2, seed
-            )
+            flying, standing = replace(options, rate_hz=1.0, missing=0.0), replace(ground, rate_hz=1.0)
+            flight = exported(folder, flying, standing, DURATION_S / 2, seed, antenna)
             found = rtklib.kinematic(folder, flight.rover, flight.base, flight.nav, BASE_ECEF)
             fixed = [s for s in found if s.fixed]
             offset = flight.errors((s.t_ns for s in fixed), (s.position for s in fixed))

@@ -134,22 +134,27 @@ class Constellation:
 def constellation(options: GnssOptions, start_ns: int, seed: int) -> Constellation:
     """The satellites of a flight that starts at GPST `start_ns`: nominal ones, or those of a navigation file.
 
-    Raises SourceError for a file that cannot be read or that holds no usable orbit.
+    Raises SourceError for systems that there are not, and for a file that cannot be read or that holds no usable orbit.
     """
+    if not options.systems or set(options.systems) - set(_PERIOD_S):
+        raise SourceError(f"option 'systems' is {options.systems!r}, must be some of GREC")
     rng = np.random.default_rng([seed, _CONSTELLATION, 0])
     found: Sequence[Ephemeris | Ionosphere] = nominal(start_ns, rng)
     if options.nav:
         found = from_navigation(Path(options.nav).expanduser(), start_ns)
     ionosphere = next((m for m in found if isinstance(m, Ionosphere) and m.system == "G"), IONOSPHERE)
     orbits = [m for m in found if not isinstance(m, Ionosphere) and m.satellite[0] in options.systems]
-    return Constellation(orbits, replace(ionosphere, t_ns=start_ns), start_ns, seed)
+    flying = Constellation(orbits, replace(ionosphere, t_ns=start_ns), start_ns, seed)
+    if not flying.satellites:
+        raise SourceError(f"option 'nav': {options.nav!r} holds no usable ephemeris of the systems {options.systems}")
+    return flying
 
 
 def from_navigation(path: Path, start_ns: int) -> list[Ephemeris | Ionosphere]:
     """One orbit of each satellite of a RINEX navigation file, and the ionosphere in it.
 
     They are moved in time, as the earth sees them, by whole hours, so that the middle of the file is the start of
-    the flight. Raises SourceError for a file that cannot be read or that holds no usable orbit.
+    the flight. Raises SourceError for a file that cannot be read.
     """
     found = list(open_rinex(f"rinex:{path}", str(path)))
     orbits = [
@@ -161,7 +166,7 @@ def from_navigation(path: Path, start_ns: int) -> list[Ephemeris | Ionosphere]:
         and getattr(m, "source", "") != "FNAV"
     ]
     if not orbits:
-        raise SourceError(f"option 'nav': {str(path)!r} holds no usable ephemeris of GPS, Galileo, BeiDou or GLONASS")
+        return []
     middle_ns = sorted(orbit.toe_ns for orbit in orbits)[len(orbits) // 2]
     shift_ns = round((start_ns - middle_ns) / HOUR_NS) * HOUR_NS
     best: dict[str, Ephemeris] = {}
