@@ -35,7 +35,7 @@ LONGEST = 400
 REASON = re.compile(r"\bone file, because\b")
 """The header of a longer file defends it in these words."""
 
-TOOLS = {"import-linter", "mypy", "pytest-timeout", "ruff"}
+TOOLS = {"import-linter", "mypy", "pytest-timeout", "ruff", "types-pyyaml"}
 READ_BY_OTHERS = {"defusedxml"}
 """Pillow reads XMP only where it is installed."""
 
@@ -126,7 +126,7 @@ def declared(*extras: str) -> set[str]:
 
 def test_every_import_is_declared_where_it_is_needed() -> None:
     assert imported("common") | imported("schemas") <= declared()
-    assert imported("air") <= declared() | declared("air")
+    assert imported("air") <= declared() | declared("air") | declared("realsense")
     assert imported("ground") <= declared() | declared("ground")
     assert imported("tests") <= declared("air", "ground", "dev")
 
@@ -200,13 +200,12 @@ def test_the_deployed_settings_load_and_list_every_key_with_its_default(name: st
         assert value == default or comment.endswith(f"Default: {json.dumps(default)}"), f"{key}: it is {default!r}"
 
 
-@pytest.mark.parametrize("name", ["luojia-air", "luojia-ground"])
-def test_a_service_starts_a_command_that_exists_with_settings_that_exist(name: str) -> None:
-    text = (ROOT / "deploy" / f"{name}.service").read_text(encoding="utf-8")
-    (line,) = re.findall(r"^ExecStart=(.*)$", text, re.MULTILINE)
+@pytest.mark.parametrize("unit", sorted((ROOT / "deploy").glob("*.service")), ids=name_of)
+def test_a_service_starts_a_command_that_exists_with_settings_that_exist(unit: Path) -> None:
+    (line,) = re.findall(r"^ExecStart=(.*)$", unit.read_text(encoding="utf-8"), re.MULTILINE)
     program, *arguments = shlex.split(line)
-    assert program == f"/opt/luojia/bin/{name}"
-    assert (ROOT / "deploy" / Path(parsed(name, arguments).config).name).exists()
+    assert Path(program).parent == Path("/opt/luojia/bin")
+    assert (ROOT / "deploy" / Path(parsed(Path(program).name, arguments).config).name).exists()
 
 
 # Documents

@@ -229,6 +229,15 @@ def test_a_false_header_costs_no_frame_that_follows_it() -> None:
         assert driver.counts.bursts == 1
 
 
+def test_a_checksum_that_looks_like_a_preamble_is_no_damage() -> None:
+    whole = next(f for f in (frame(0x99, bytes([i])) for i in range(256)) if f[-1] == 0xFA)
+    driver = XsensImu()
+    driver.feed(whole, 0)
+    driver.feed(whole, 0)
+    assert driver.counts.frames == {"0x99": 2}
+    assert driver.counts.dropped_bytes == driver.counts.bursts == 0
+
+
 @given(st.binary(max_size=3000), st.integers(1, 500))
 def test_any_bytes_are_accounted_for(data: bytes, chunk: int) -> None:
     driver = XsensImu()

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, TiffImagePlugin
 
-from air.sources.exif import GPS_EPOCH, R_enu_cam, read_facts
+from air.sources.exif import EPOCH, R_enu_cam, read_facts
 from air.sources.source import PhotoSource, open_photos
 from common.geo import geodetic_to_enu
 from common.messages import Datum, Photo
@@ -110,7 +110,7 @@ def test_a_photo_without_a_believable_position_has_no_fix_and_says_why(jpeg: byt
 
 
 def test_the_sub_seconds_of_the_clock_are_read() -> None:
-    elapsed_ns = round((START - GPS_EPOCH).total_seconds()) * 10**9
+    elapsed_ns = round((START - EPOCH).total_seconds()) * 10**9
     assert read_facts(make_jpeg(subsec="25")).t_ns == elapsed_ns + 250_000_000
     assert read_facts(make_jpeg(subsec="??")).t_ns == elapsed_ns
 

@@ -52,7 +52,7 @@ class FrameScanner:
         while True:
             begin = held.find(_HEADER, at)
             if begin < 0:  # the last byte may be the first half of a header
-                begin = len(held) - held.endswith(_HEADER[:1])
+                begin = max(at, len(held) - held.endswith(_HEADER[:1]))
             self._drop(begin - at)
             at = begin
             extent = _extent(held, at)

@@ -17,7 +17,7 @@ from common.arrays import F64
 from common.camera import CameraModel
 from common.messages import GnssFix
 
-GPS_EPOCH = datetime(1980, 1, 6)
+EPOCH = datetime(1970, 1, 1)
 SIGMA_HORIZONTAL = 1.5
 SIGMA_VERTICAL = 3.0
 ATTITUDE_SIGMA = math.radians(10.0)
@@ -83,14 +83,14 @@ def read_facts(jpeg: bytes) -> PhotoFacts:
 
 
 def clock_time(tags: dict[int, Any]) -> int | None:
-    """Nanoseconds since the GPS epoch on the camera's own clock, from DateTimeOriginal and its sub-seconds."""
+    """Nanoseconds since 1970 on the camera's own clock, from DateTimeOriginal and its sub-seconds."""
     try:
         taken = datetime.strptime(str(tags[_DATE_TIME_ORIGINAL]).strip(" \0"), "%Y:%m:%d %H:%M:%S")
     except (KeyError, ValueError):
         return None
     subsec = str(tags.get(_SUBSEC_ORIGINAL, "")).strip(" \0")
     fraction = int(subsec[:9].ljust(9, "0")) if subsec.isascii() and subsec.isdigit() else 0
-    elapsed = taken - GPS_EPOCH
+    elapsed = taken - EPOCH
     return (elapsed.days * 86_400 + elapsed.seconds) * 1_000_000_000 + fraction
 
 

@@ -25,7 +25,7 @@ HEIGHT, ALONG, ACROSS = 40.0, 8.4, 17.0
 """Above ground, between photos and between lines, m: 78 % forward and 67 % side overlap."""
 MARGIN = 45.0
 """How much of the world reaches beyond the outermost cameras, m."""
-START_NS = 1_401_267_600 * 1_000_000_000
+START_NS = 1_717_232_400 * 1_000_000_000
 """2024-06-01 09:00 GPST."""
 ATTITUDE_SIGMA = float(np.radians(2.0))
 _FLIGHT, _CAMERA, _GNSS, _GIMBAL, _SENSOR = range(10, 15)
