@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -445,6 +446,31 @@ def test_impossible_options_are_named() -> None:
 
 
 # RTKLIB
+
+
+def test_rtklib_reads_the_bytes_and_is_right_to_centimetres(tmp_path: Path) -> None:
+    """Its own decoder of UBX and of all four navigation messages, not ours."""
+    (tmp_path / "x.ubx").write_bytes(b"".join(data for _, data in rover(replace(PERFECT, rate_hz=0.5), 65.0).packets()))
+    command = (
+        rtklib.program("convbin"),
+        "-r",
+        "ubx",
+        "-v",
+        "3.04",
+        "-od",
+        "-os",
+        "-o",
+        "x.obs",
+        "-n",
+        "x.nav",
+        "x.ubx",
+    )
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True)
+    found = rtklib.single_point(tmp_path, tmp_path / "x.obs", tmp_path / "x.nav", "GREC", 10.0)
+    truth, _ = circling((np.array([s.t_ns for s in found]) - START_NS) / SECOND_NS)
+    assert len(found) > 30
+    assert min(s.satellites for s in found) > 35
+    assert np.linalg.norm([s.position for s in found] - truth, axis=1).max() < 0.1
 
 
 def test_without_errors_rtklib_is_right_to_centimetres(tmp_path: Path) -> None:

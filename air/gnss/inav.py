@@ -66,6 +66,24 @@ EPHEMERIS = Layout(
     ),
 )
 """Words 1 to 5."""
+_TIME = Layout(
+    1,
+    WORD_BITS,
+    (
+        unsigned("type", 1, (1, 1, 6)),
+        unsigned("valid", 1, (1, 7, 2)),
+        unsigned("week", 1, (1, 97, 12)),
+        unsigned("tow", 1, (1, 109, 20)),
+    ),
+)
+"""Word 0."""
+_UTC = Layout(
+    1,
+    WORD_BITS,
+    (unsigned("type", 1, (1, 1, 6)), signed("leap_s", 1, (1, 63, 8)), unsigned("tow", 1, (1, 106, 20))),
+)
+"""Word 6: of GST against UTC, only whole seconds are read and written."""
+_TIME_VALID = 0b10
 
 
 def word(words: Sequence[int]) -> int | None:
@@ -152,6 +170,19 @@ def pages(eph: KeplerEphemeris, sent_ns: int) -> list[tuple[int, ...]]:
         "tow": tow_s,
     }
     return [page(word) for word in EPHEMERIS.write(values)]
+
+
+def time_page(sent_ns: int) -> tuple[int, ...]:
+    """The page with word 0, which tells week and time, sent at a time in GPST, ns, a whole second."""
+    week, tow_s = to_week(sent_ns)
+    (word,) = _TIME.write({"type": 0, "valid": _TIME_VALID, "week": week - FIRST_WEEK, "tow": tow_s})
+    return page(word)
+
+
+def utc_page(leap_s: int, sent_ns: int) -> tuple[int, ...]:
+    """The page with word 6, which tells GPST minus UTC, sent at a time in GPST, ns, a whole second."""
+    (word,) = _UTC.write({"type": 6, "leap_s": leap_s, "tow": to_week(sent_ns)[1]})
+    return page(word)
 
 
 def sisa_m(index: int) -> float:

@@ -20,8 +20,9 @@ from common.measurements import Ephemeris, GlonassEphemeris, KeplerEphemeris
 EARTH_RATE = 7.2921151467e-5
 """Rotation of the earth, rad/s, in GPS and Galileo and for the Sagnac correction."""
 _BEIDOU_RATE = 7.292115e-5
-_MU = {"G": 3.9860050e14, "J": 3.9860050e14, "E": 3.986004418e14, "C": 3.986004418e14}
-_RATE = {"G": EARTH_RATE, "J": EARTH_RATE, "E": EARTH_RATE, "C": _BEIDOU_RATE}
+MU = {"G": 3.9860050e14, "J": 3.9860050e14, "E": 3.986004418e14, "C": 3.986004418e14}
+RATE = {"G": EARTH_RATE, "J": EARTH_RATE, "E": EARTH_RATE, "C": _BEIDOU_RATE}
+"""Gravity, m³/s², and rotation of the earth, rad/s, by which the satellites of a system count their orbits."""
 _GEO_TILT = np.radians(-5.0)
 
 _GLONASS_MU, _GLONASS_RADIUS, _GLONASS_J2, _GLONASS_RATE = 3.9860044e14, 6378136.0, 1.0826257e-3, 7.292115e-5
@@ -105,8 +106,8 @@ def _kepler(ephemerides: Sequence[KeplerEphemeris], t_ns: int, offset_s: F64) ->
     sqrt_a, e, i0, omega0, omega, m0, delta_n, idot, omega_dot = elements[:9]
     cuc, cus, crc, crs, cic, cis, af0, af1, af2 = elements[9:]
     systems = [ephemeris.satellite[:1] for ephemeris in ephemerides]
-    mu = np.array([_MU.get(system, np.nan) for system in systems])
-    rate = np.array([_RATE.get(system, np.nan) for system in systems])
+    mu = np.array([MU.get(system, np.nan) for system in systems])
+    rate = np.array([RATE.get(system, np.nan) for system in systems])
     toe_ns = np.array([ephemeris.toe_ns for ephemeris in ephemerides], np.int64)
     toc_ns = np.array([ephemeris.toc_ns for ephemeris in ephemerides], np.int64)
     bdt_ns = np.array([BDT_MINUS_GPST_NS if system == "C" else 0 for system in systems], np.int64)

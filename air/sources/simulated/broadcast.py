@@ -1,7 +1,7 @@
 """When satellites send which piece of their navigation messages, as a receiver hands it out.
 
-Pieces that hold neither ephemeris nor ionosphere (almanacs and the like) are left out. Sources: IS-GPS-200, 20.3.2 and
-figure 20-1; Galileo OS SIS ICD, table 41 (E1-B); BeiDou B1I ICD, 5.2.2 and 5.3.2; GLONASS ICD 5.1, 4.3.
+Pieces that hold neither ephemeris nor ionosphere nor time (almanacs and the like) are left out. Sources: IS-GPS-200,
+20.3.2 and figure 20-1; Galileo OS SIS ICD, table 41 (E1-B); BeiDou B1I ICD, 5.2.2 and 5.3.2; GLONASS ICD 5.1, 4.3.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
-from air.gnss.gnss_time import BDT_MINUS_GPST_NS, DAY_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
+from air.gnss.gnss_time import BDT_MINUS_GPST_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
 from air.gnss.orbit import is_geostationary
 from air.sensors.ubx_messages import NavigationBits
 from air.sources.simulated.constellation import Constellation
@@ -19,9 +19,8 @@ from common.measurements import GlonassEphemeris, KeplerEphemeris
 _FRAME_NS = 30 * SECOND_NS
 _FLIGHT_TIME_NS = 75_000_000
 _LNAV_PAGES, _KLOBUCHAR_PAGE = 25, 18
-_INAV_WORDS = {2: 0, 4: 2, 1: 20, 3: 22, 5: 24}
-"""When a word is sent on E1-B, s from the frame's begin."""
-_GLONASS_FRAMES = 5
+_INAV_WORDS = ((0, 2), (2, 4), (4, 6), (10, 0), (20, 1), (22, 3), (24, 5))
+"""When, s from the frame's begin, which word is sent on E1-B."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +58,14 @@ class Broadcast:
     def _encoded(self, satellite: str, t_ns: int) -> Iterator[Piece]:
         eph = self._constellation.issue(satellite, t_ns)
         if isinstance(eph, GlonassEphemeris):
-            for i, words in enumerate(self._glonass(eph, t_ns)):
+            for i, words in enumerate(glonass_strings.strings(eph, t_ns, self._constellation.leap_s)):
                 yield _piece(t_ns, 2 * i, 2, NavigationBits(satellite, "1C", eph.channel, words))
         elif satellite[0] == "G":
             for i, words in enumerate(self._lnav(eph, t_ns)):
                 yield _piece(t_ns, 6 * i, 6, NavigationBits(satellite, "1C", 0, words))
         elif satellite[0] == "E":
-            for word, after_s in sorted(_INAV_WORDS.items(), key=lambda item: item[1]):
-                page = inav.pages(eph, t_ns + after_s * SECOND_NS)[word - 1]
+            for after_s, word in _INAV_WORDS:
+                page = self._inav(eph, word, t_ns + after_s * SECOND_NS)
                 yield _piece(t_ns, after_s, 2, NavigationBits(satellite, "1B", 0, page))
         else:
             step_s, length_s = (3.0, 0.6) if is_geostationary(satellite) else (6.0, 6.0)
@@ -81,9 +80,12 @@ class Broadcast:
             subframes.append(lnav.ionosphere_words(self._constellation.ionosphere, t_ns + 18 * SECOND_NS))
         return subframes
 
-    def _glonass(self, eph: GlonassEphemeris, t_ns: int) -> list[tuple[int, ...]]:
-        superframe, frame = divmod((t_ns - GPS_EPOCH_NS) % DAY_NS // _FRAME_NS, _GLONASS_FRAMES)
-        return glonass_strings.strings(eph, (superframe + 1) << 16 | frame + 1, self._constellation.leap_s)
+    def _inav(self, eph: KeplerEphemeris, word: int, sent_ns: int) -> tuple[int, ...]:
+        if word == 0:
+            return inav.time_page(sent_ns)
+        if word == 6:
+            return inav.utc_page(self._constellation.leap_s, sent_ns)
+        return inav.pages(eph, sent_ns)[word - 1]
 
 
 def _piece(frame_ns: int, after_s: float, length_s: float, bits: NavigationBits) -> Piece:

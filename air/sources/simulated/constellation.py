@@ -17,10 +17,10 @@ from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
 from air.gnss.calendar import leap_seconds, to_calendar
 from air.gnss.ephemerides import is_healthy
 from air.gnss.gnss_time import BEIDOU_EPOCH_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
-from air.gnss.orbit import EARTH_RATE, is_geostationary, states_at
+from air.gnss.orbit import MU, RATE, is_geostationary, states_at
 from air.sources.rinex import open_rinex
 from air.sources.simulated.gnss_options import GnssOptions
-from air.sources.simulated.nominal_orbits import nominal
+from air.sources.simulated.nominal_orbits import nominal, wrapped
 from common.errors import SourceError
 from common.measurements import Ephemeris, GlonassEphemeris, Ionosphere, KeplerEphemeris
 
@@ -40,7 +40,6 @@ _LEAD_S = {"G": 7200, "E": -600, "C": 0, "R": 900}
 _PHASE_STEP_S = 16
 """GPS satellites in their turn are uploaded at any time; reference times are multiples of this."""
 _REACH_NS = 2 * HOUR_NS
-_BEIDOU_RATE = 7.292115e-5
 
 
 class Constellation:
@@ -96,13 +95,13 @@ class Constellation:
         issue = number % 256 if orbit.satellite[0] == "G" else number % 1024
         issue = 1 if orbit.satellite[0] == "C" else issue
         dt, dt_clock = (toe_ns - orbit.toe_ns) / SECOND_NS, (toe_ns - orbit.toc_ns) / SECOND_NS
-        mu = 3.9860050e14 if orbit.satellite[0] == "G" else 3.986004418e14
+        mean_motion = np.sqrt(MU[orbit.satellite[0]]) / orbit.sqrt_a**3 + orbit.delta_n
         return replace(
-            turned(orbit, toe_ns, orbit.omega_dot - _rate(orbit)),
+            turned(orbit, toe_ns, orbit.omega_dot - RATE[orbit.satellite[0]]),
             iode=issue,
             iodc=issue,
             toc_ns=toe_ns,
-            m0=_wrapped(orbit.m0 + (np.sqrt(mu) / orbit.sqrt_a**3 + orbit.delta_n) * dt),
+            m0=wrapped(orbit.m0 + mean_motion * dt),
             i0=orbit.i0 + orbit.idot * dt,
             af0=orbit.af0 + orbit.af1 * dt_clock + orbit.af2 * dt_clock**2,
             af1=orbit.af1 + 2 * orbit.af2 * dt_clock,
@@ -110,21 +109,20 @@ class Constellation:
 
     def _rounded(self, orbit: Ephemeris) -> Ephemeris:
         """What a receiver decodes of it. Raises ValueError for a value that the message cannot hold."""
-        t_ns = orbit.toe_ns
+        t_ns, name = orbit.toe_ns, orbit.satellite
+        found: Ephemeris | None
         if isinstance(orbit, GlonassEphemeris):
-            strings = [glonass_strings.string(words) or 0 for words in glonass_strings.strings(orbit, 1, self.leap_s)]
-            found: Ephemeris | None = glonass_strings.ephemeris(
-                strings, orbit.satellite, orbit.channel, t_ns, self.leap_s
-            )
-        elif orbit.satellite[0] == "G":
-            parts = [lnav.subframe(words) or 0 for words in lnav.ephemeris_words(orbit, t_ns // HOUR_NS * HOUR_NS)]
-            found = lnav.ephemeris(parts, orbit.satellite, t_ns)
-        elif orbit.satellite[0] == "E":
-            parts = [inav.word(words) or 0 for words in inav.pages(orbit, t_ns)]
-            found = inav.ephemeris(parts, orbit.satellite, t_ns)
+            strings = map(glonass_strings.string, glonass_strings.strings(orbit, t_ns, self.leap_s))
+            found = glonass_strings.ephemeris([bits or 0 for bits in strings], name, orbit.channel, t_ns, self.leap_s)
+        elif name[0] == "G":
+            subframes = map(lnav.subframe, lnav.ephemeris_words(orbit, t_ns // HOUR_NS * HOUR_NS))
+            found = lnav.ephemeris([bits or 0 for bits in subframes], name, t_ns)
+        elif name[0] == "E":
+            words = map(inav.word, inav.pages(orbit, t_ns))
+            found = inav.ephemeris([bits or 0 for bits in words], name, t_ns)
         else:
-            pages = beidou_d1_d2.ephemeris_words(orbit, self.ionosphere, t_ns)
-            both = beidou_d1_d2.ephemeris([beidou_d1_d2.subframe(w) or 0 for w in pages], orbit.satellite, t_ns)
+            subframes = map(beidou_d1_d2.subframe, beidou_d1_d2.ephemeris_words(orbit, self.ionosphere, t_ns))
+            both = beidou_d1_d2.ephemeris([bits or 0 for bits in subframes], name, t_ns)
             found = both[0] if both else None
         if found is None:
             raise ValueError(f"{orbit.satellite} cannot be broadcast")
@@ -184,8 +182,8 @@ def turned(orbit: KeplerEphemeris, toe_ns: int, node_rate: float) -> KeplerEphem
     dt = (toe_ns - orbit.toe_ns) / SECOND_NS
     epoch_ns = BEIDOU_EPOCH_NS if orbit.satellite[0] == "C" else GPS_EPOCH_NS
     before_s, after_s = ((toe - epoch_ns) % WEEK_NS / SECOND_NS for toe in (orbit.toe_ns, toe_ns))
-    omega0 = orbit.omega0 + node_rate * dt + _rate(orbit) * (after_s - before_s)
-    return replace(orbit, toe_ns=toe_ns, omega0=_wrapped(omega0))
+    omega0 = orbit.omega0 + node_rate * dt + RATE[orbit.satellite[0]] * (after_s - before_s)
+    return replace(orbit, toe_ns=toe_ns, omega0=wrapped(omega0))
 
 
 def _shifted(orbit: Ephemeris, shift_ns: int) -> Ephemeris:
@@ -193,11 +191,3 @@ def _shifted(orbit: Ephemeris, shift_ns: int) -> Ephemeris:
     if isinstance(orbit, GlonassEphemeris):
         return replace(orbit, toe_ns=orbit.toe_ns + shift_ns)
     return replace(turned(orbit, orbit.toe_ns + shift_ns, 0.0), toc_ns=orbit.toc_ns + shift_ns)
-
-
-def _rate(orbit: KeplerEphemeris) -> float:
-    return _BEIDOU_RATE if orbit.satellite[0] == "C" else EARTH_RATE
-
-
-def _wrapped(angle: float) -> float:
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)

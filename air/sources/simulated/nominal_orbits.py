@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from air.gnss.gnss_time import BEIDOU_EPOCH_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
-from air.gnss.orbit import EARTH_RATE
+from air.gnss.orbit import EARTH_RATE, RATE
 from common.arrays import F64
 from common.measurements import Ephemeris, GlonassEphemeris, KeplerEphemeris
 
@@ -59,7 +59,7 @@ def _kepler(
     scatter_deg: float = 1.5,
 ) -> KeplerEphemeris:
     """A Kepler orbit: `node_deg` over the earth at the start, `argument_deg` from the node to the satellite then."""
-    epoch_ns, rate = (BEIDOU_EPOCH_NS, 7.292115e-5) if satellite[0] == "C" else (GPS_EPOCH_NS, EARTH_RATE)
+    epoch_ns = BEIDOU_EPOCH_NS if satellite[0] == "C" else GPS_EPOCH_NS
     inclination, node, argument = np.radians([inclination_deg, node_deg, argument_deg]) + np.radians(
         scatter_deg
     ) * rng.normal(size=3) * (0.3, 1.0, 1.0)
@@ -86,9 +86,9 @@ def _kepler(
         sqrt_a=float(np.sqrt(a)),
         e=e,
         i0=float(inclination),
-        omega0=_wrapped(node + rate * ((start_ns - epoch_ns) % WEEK_NS / SECOND_NS)),
+        omega0=wrapped(node + RATE[satellite[0]] * ((start_ns - epoch_ns) % WEEK_NS / SECOND_NS)),
         omega=float(perigee),
-        m0=_wrapped(eccentric - e * np.sin(eccentric)),
+        m0=wrapped(eccentric - e * np.sin(eccentric)),
         delta_n=0.0 if still else float(rng.uniform(4e-9, 5e-9)),
         idot=0.0 if still else float(rng.uniform(-2e-10, 2e-10)),
         omega_dot=0.0 if still else float(rng.uniform(-8.5e-9, -7.5e-9)),
@@ -107,7 +107,7 @@ def _glonass(start_ns: int, rng: np.random.Generator) -> Iterator[GlonassEphemer
         node, argument, tilt = np.radians([120.0 * (i // 8) + 70.0, 45.0 * (i % 8) + 15.0 * (i // 8), 64.8])
         node, argument, tilt = np.array([node, argument, tilt]) + np.radians(1.0) * rng.normal(size=3) * (1, 1, 0.2)
         position = _GLONASS_A * _in_plane(node, tilt, argument)
-        turning = np.cross((0.0, 0.0, 7.292115e-5), position)
+        turning = np.cross((0.0, 0.0, EARTH_RATE), position)
         velocity = speed * _in_plane(node, tilt, argument + np.pi / 2) - turning
         yield GlonassEphemeris(
             t_ns=start_ns,
@@ -134,5 +134,6 @@ def _three(values: npt.NDArray[np.floating[Any]]) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
+    """The angle within ±π rad."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
