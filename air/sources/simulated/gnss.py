@@ -130,14 +130,14 @@ class SimulatedReceiver:
         return (t_ns - self._sky.start_ns) / SECOND_NS
 
     def _seconds(self) -> Iterator[tuple[int, Iterator[tuple[Observed, Tracked]]]]:
-        rng = np.random.default_rng([self._seed, self._part + TRACKING])
-        tracking = Tracking(self.options, len(self._sky.satellites), rng)
+        tracking = Tracking(self.options, len(self._sky.satellites), self._rng(0))
         clock = _Milliseconds()
         for number, observables in self._observer.seconds(self._duration_s):
-            chances = np.random.default_rng([self._seed, self._part + TRACKING, number]).random(
-                (len(observables.t_s), 2, *self._names.shape)
-            )
+            chances = self._rng(number + 1).random((len(observables.t_s), 2, *self._names.shape))
             yield number, self._epochs(observables, tracking, clock, chances)
+
+    def _rng(self, number: int) -> np.random.Generator:
+        return np.random.default_rng([self._seed, self._part + TRACKING, number])
 
     def _epochs(
         self, now: Observables, tracking: Tracking, clock: _Milliseconds, chances: F64

@@ -34,6 +34,9 @@ CLOCK, MULTIPATH, NOISE, CHANNELS, MISSING, TRACKING = range(6)
 """Random streams of a receiver, counted from its first part number."""
 
 
+_Conditions = tuple[Air, Multipath, Bool]
+
+
 @dataclass(frozen=True, eq=False)
 class Observables:
     """N epochs of one second and S satellites with two signals each.
@@ -77,18 +80,24 @@ class Observer:
     def seconds(self, duration_s: float) -> Iterator[tuple[int, Observables]]:
         """The observables of each second of the flight, with its number."""
         states = multipath(self._options, len(self._sky.satellites), self._key[0], self._key[1] + MULTIPATH)
-        for (second, here), (_, then) in pairwise(enumerate(map(self._conditions, range(int(duration_s) + 2), states))):
-            t_s = self._times(second)
-            yield second, self._observe(second, t_s[t_s <= duration_s], here, then)
+        conditions = map(self._conditions, range(int(duration_s) + 2), states)
+        for second, (here, then) in enumerate(pairwise(conditions)):
+            t_s = self._clock.time_of(self._ticks(second))
+            present = self._present(second, len(t_s)) & (t_s <= duration_s)
+            noise = self._rng(NOISE, second).standard_normal((3, len(t_s), len(self._sky.satellites), 2))
+            yield second, self._observe(second, t_s[present], noise[:, present], here, then)
 
-    def _times(self, second: int) -> F64:
-        """True times (N,) of the epochs that the uncorrected clock places in a second."""
+    def _ticks(self, second: int) -> F64:
+        """Epochs (N,) in a second, s of the uncorrected clock."""
         rate = self._options.rate_hz
-        ticks = np.arange(np.ceil(second * rate), np.ceil((second + 1) * rate))
-        missing = np.random.default_rng([*self._stream(MISSING), second]).random(len(ticks)) < self._options.missing
-        return self._clock.time_of(ticks[~missing] / rate)
+        return np.asarray(np.arange(np.ceil(second * rate), np.ceil((second + 1) * rate)) / rate)
 
-    def _conditions(self, second: int, state: Multipath) -> tuple[Air, Multipath, Bool]:
+    def _present(self, second: int, epochs: int) -> Bool:
+        """Which of a second's epochs are not missing."""
+        return np.asarray(self._rng(MISSING, second).random(epochs) >= self._options.missing)
+
+    def _conditions(self, second: int, state: Multipath) -> _Conditions:
+        """What holds at the begin of a second: the air, multipath, and which satellites are in sight."""
         position, _ = self._antenna(np.array([float(second)]))
         air = self._sky.air(float(second), position[0])
         seen = air.elevation >= np.radians(self._options.mask_deg)
@@ -96,13 +105,7 @@ class Observer:
             seen[seen] = ~self._blocked(self._T_world_ecef.apply(position[0]), air.direction[seen])
         return air, state, seen
 
-    def _observe(
-        self,
-        second: int,
-        t_s: F64,
-        here: tuple[Air, Multipath, Bool],
-        then: tuple[Air, Multipath, Bool],
-    ) -> Observables:
+    def _observe(self, second: int, t_s: F64, noise: F64, here: _Conditions, then: _Conditions) -> Observables:
         (air, echo, seen), (air_then, echo_then, _) = here, then
         options, sky = self._options, self._sky
         geometry = sky.geometry(t_s, *self._antenna(t_s))
@@ -115,14 +118,12 @@ class Observer:
         bent = l1_squared_over(sky.frequency)
         ionosphere = between(air.ionosphere, air_then.ionosphere)[..., None] * bent
         troposphere = between(air.troposphere, air_then.troposphere)[..., None]
-        air_rate = (air_then.troposphere - air.troposphere)[:, None] - bent * (air_then.ionosphere - air.ionosphere)[
-            :, None
-        ]
+        ionosphere_rate = (air_then.ionosphere - air.ionosphere)[:, None] * bent
+        air_rate = (air_then.troposphere - air.troposphere)[:, None] - ionosphere_rate
         distance = geometry.distance - geometry.clock + LIGHT * clock[:, None] + self._inter_system
 
         cn0 = self._cn0(air.elevation, t_s) + between(echo.fading, echo_then.fading)
         sigma = 10 ** ((NOISE_CN0 - cn0) / 20)
-        noise = self._noise(second, len(t_s), cn0.shape)
         growth = multipath_growth(air.elevation)[:, None]
         code_echo = options.multipath * growth * between(echo.code, echo_then.code)
         carrier_echo = options.carrier_multipath * growth * between(echo.carrier, echo_then.carrier)
@@ -154,10 +155,5 @@ class Observer:
             jammed = np.maximum(jammed, np.clip(np.minimum(t_s - start, end - t_s) / _RAMP_S, 0.0, 1.0))
         return np.asarray(clear - self._options.jamming_db * jammed[:, None, None])
 
-    def _noise(self, second: int, epochs: int, shape: tuple[int, ...]) -> F64:
-        """White noise (3, N, S, 2) of unit deviation: code, carrier, rate."""
-        rng = np.random.default_rng([*self._stream(NOISE), second])
-        return rng.standard_normal((3, epochs, *shape[1:]))
-
-    def _stream(self, which: int) -> tuple[int, int]:
-        return self._key[0], self._key[1] + which
+    def _rng(self, stream: int, second: int) -> np.random.Generator:
+        return np.random.default_rng([self._key[0], self._key[1] + stream, second])
