@@ -12,11 +12,11 @@ from air.sources.source import open_source
 from common.bus import Bus, ZenohBus
 from common.clock import Clock, SystemClock
 from common.errors import BusError, SourceError, WireError
-from common.keys import alive_key, message_key
-from common.measurements import Measurement
+from common.keys import alive_key, message_key, stream_key
+from common.measurements import Measurement, RawBytes
 from common.messages import Health, Message
 from common.streams import HEALTH, RTCM, STREAMS, Stream
-from common.wire import encode
+from common.wire import decode, encode
 
 log = logging.getLogger(__name__)
 
@@ -57,13 +57,21 @@ class Sensing:
     def run(self) -> None:
         """Publish all that comes. Raises BusError."""
         alive = self._bus.declare_alive(alive_key(self._vehicle, ROLE))
+        corrections = self._bus.subscribe(stream_key(self._vehicle, RTCM), self._correct)
         self._beat.start()
         try:
             for measurement in self._live:
                 self._publish(STREAM_OF[type(measurement)], measurement)
         finally:
             self._ended.set()
+            corrections.close()
             alive.close()
+
+    def _correct(self, key: str, payload: bytes) -> None:
+        try:
+            self._live.correct(decode(RawBytes, payload).data)
+        except WireError as error:
+            log.warning("%s: %s", key, error)
 
     def _beat_on(self) -> None:
         while not self._ended.wait(BEAT_S):

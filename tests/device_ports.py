@@ -92,6 +92,10 @@ class LineDriver:
         self.counts = Counts()
         self._held = b""
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        return ()
+
     def start(self) -> bytes:
         return b"go\n"
 

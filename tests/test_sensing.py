@@ -12,11 +12,12 @@ from bus_network import client_of, collect
 from device_aircraft import Aircraft
 from device_ports import wait_for
 
-from common.keys import all_of
+from air.sensors import rtcm
+from common.keys import all_of, stream_key
 from common.measurements import ClockPhase, ClockState, ImuSample, RawBytes, ReceiverSolution
 from common.messages import Health, Level
-from common.streams import CLOCK, HEALTH, RAW_BYTES, RAW_GNSS, RAW_IMU, RAW_SOLUTION
-from common.wire import decode
+from common.streams import CLOCK, HEALTH, RAW_BYTES, RAW_GNSS, RAW_IMU, RAW_SOLUTION, RTCM
+from common.wire import decode, encode
 
 
 @pytest.fixture
@@ -53,6 +54,25 @@ def test_run_publishes_its_devices_and_one_that_was_pulled_out_comes_back(aircra
     aircraft.imu.plug()
     assert wait_for(lambda: heard("imu") > count, 5.0) <= 2.0
     wait_for(lambda: newest("imu").level is Level.OK, 5.0)
+    bus.close()
+
+
+def test_corrections_of_the_ground_reach_the_receiver_whole_and_nothing_else_does(aircraft: Aircraft) -> None:
+    aircraft.run()
+    wait_for(lambda: "gnss" in aircraft.programs[0].said(), 20.0)
+    bus = client_of(aircraft.endpoint)
+    correction = rtcm.frame(bytes([0x43, 0x50]) + bytes(60))
+    key, written = stream_key("uav1", RTCM), bytearray()
+
+    def arrived() -> bool:
+        for data in (b"stray" + correction[:20], correction[20:], correction[:-1] + b"?"):
+            bus.publish(key, encode(RawBytes(1, "base", data)), RTCM)
+        written.extend(aircraft.gnss.sent_by_host())
+        return written.count(correction) > 1
+
+    wait_for(arrived, 10.0)
+    assert b"stray" not in written
+    assert correction[:-1] + b"?" not in written
     bus.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,8 @@ LISTEN_S = 0.6
 PROBE_AGAIN_S = 20.0
 RETRY_S = (0.1, 0.2, 0.4, 0.8)
 """Waits between attempts to open, the last one for ever: a device that comes back is read within two seconds."""
+OUTGOING = 100
+"""Writes that may wait: old corrections are worth nothing."""
 START_AGAIN_S = 5.0
 """A device that was switched off and on has forgotten its set-up: one that is silent is set up again."""
 
@@ -56,8 +59,14 @@ class Port:
         self._baud = config.baud
         self._probed_s = self._set_up_s = -float("inf")
         self._said = ""
+        self._outgoing: deque[bytes] = deque(maxlen=OUTGOING)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name=driver.device, daemon=True)
+
+    @property
+    def device(self) -> str:
+        """Name of the device."""
+        return self._driver.device
 
     def start(self) -> None:
         """Begin to read, as soon as the device is there."""
@@ -79,8 +88,11 @@ class Port:
             "frames": seen.frames.total(),
         }
         status = self._watch.status(time.monotonic(), counts)
-        faults: tuple[str, ...] = getattr(self._driver, "faults", ())
-        return status if status.fault or not faults else replace(status, fault="; ".join(faults))
+        return status if status.fault else replace(status, fault="; ".join(self._driver.faults))
+
+    def send(self, data: bytes) -> None:
+        """Write to the device as soon as may be; while it is gone, what is to be written is lost."""
+        self._outgoing.append(data)
 
     def _run(self) -> None:
         failed = 0
@@ -98,11 +110,13 @@ class Port:
     def _use(self, link: Link) -> None:
         """Read until the device is gone or nobody wants to read any more."""
         self._watch.opened(time.monotonic())
+        self._outgoing.clear()
         self._say(f"{self._config.port} is open")
         try:
             self._set_up(link)
             while not self._stopped.is_set():
                 self._read(link)
+                self._write(link)
                 self._look_after(link)
         except OSError as error:
             self._lost(f"was lost: {' '.join(str(error).split())}; waiting for it to come back")
@@ -124,6 +138,10 @@ class Port:
         self._watch.received(arrival_ns * 1e-9, len(data), frames, dropped, kinds)
         raw = RawBytes(arrival_ns, self._driver.device, data)
         self._take(Arrival(self._driver.device, self._driver.scale, arrival_ns, [raw, *measurements]))
+
+    def _write(self, link: Link) -> None:
+        while self._outgoing:
+            link.write(self._outgoing.popleft())
 
     def _look_after(self, link: Link) -> None:
         """Help a device that is open but gives nothing."""

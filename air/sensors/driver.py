@@ -38,6 +38,11 @@ class Driver(Protocol):
         """What it has seen so far."""
         ...
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What is wrong with the device or its set-up, as far as it says so itself: a line each."""
+        ...
+
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
         """Measurements that these bytes complete. `t_ns` is when they arrived, in the host's time."""
         ...

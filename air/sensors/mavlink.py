@@ -36,6 +36,11 @@ class MavlinkVehicle:
         """Bytes and messages so far, of all systems."""
         return self._telemetry.counts
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """None: what is wrong with the drone stands in its state."""
+        return ()
+
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
         """States of the vehicle that follow from these bytes, ten a second at most."""
         return [*self._telemetry.feed(data, t_ns)]

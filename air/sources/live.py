@@ -15,6 +15,7 @@ from air.devices.port import Arrival, Port
 from air.devices.settings import DevicesConfig, PortConfig
 from air.devices.status import DeviceStatus
 from air.sensors.driver import Driver, TimeScale
+from air.sensors.rtcm import RtcmFilter
 from air.sources.source import Problem, Truth
 from air.timing import Timebase
 from common.clock import Clock, SystemClock
@@ -41,6 +42,7 @@ class Live:
         self._url = url
         self._clock = clock or SystemClock()
         self._arrivals: queue.Queue[Arrival] = queue.Queue(QUEUE)
+        self._corrections = RtcmFilter()
         self._dropped = 0
         self._closed = False
         self._timebase = Timebase(
@@ -76,6 +78,14 @@ class Live:
     def statuses(self) -> list[DeviceStatus]:
         """How each device is doing now."""
         return [reader.status() for reader in self._readers]
+
+    def correct(self, data: bytes) -> None:
+        """Pass the whole RTCM frames among corrections from the ground on to the receiver."""
+        frames = self._corrections.feed(data)
+        for reader in self._readers:
+            if isinstance(reader, Port) and reader.device == "gnss":
+                for frame in frames:
+                    reader.send(frame)
 
     def start(self) -> None:
         """Begin to read the devices."""
