@@ -95,15 +95,21 @@ def test_code_minus_carrier_is_constant_but_for_twice_the_ionosphere() -> None:
 
 
 def test_ambiguities_are_whole_numbers_that_only_slips_change() -> None:
-    observed = list(rover(replace(DEFAULT, slips=400.0), 60.0).observations())
+    observed = list(rover(replace(DEFAULT, slips=400.0, jamming="20-50", jamming_db=14.0), 60.0).observations())
     last: dict[tuple[str, str], tuple[float, float]] = {}
-    slips = 0
+    lost: set[tuple[str, str]] = set()
+    slips = found_again = 0
     for o in observed:
         e = o.epoch
         for i, key in enumerate(zip(e.satellites, e.signals, strict=True)):
             if np.isnan(e.carrier_phase[i]):
                 last.pop(key, None)
+                lost.add(key)
                 continue
+            if key in lost:
+                lost.remove(key)
+                found_again += 1
+                assert e.lock_s[i] == 0.0
             whole = o.ambiguity[i] if not e.half_cycle[i] else np.floor(o.ambiguity[i])
             assert whole == round(whole)
             if key in last and last[key][0] != whole:
@@ -112,6 +118,7 @@ def test_ambiguities_are_whole_numbers_that_only_slips_change() -> None:
                 assert e.lock_s[i] < 1.0
             last[key] = whole, e.lock_s[i]
     assert slips > 5
+    assert found_again > 5
 
 
 def test_the_clock_stays_within_half_a_millisecond_and_says_when_it_jumps() -> None:

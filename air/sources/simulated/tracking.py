@@ -65,8 +65,9 @@ class Tracking:
         carrier = code & (cn0 >= CARRIER_CN0) & (t_s - self._code_since >= self._lock_delay)
         started = carrier & ~self._carrier
         slipped = carrier & self._carrier & (chance[0] < self._slip_rate(cn0) * dt)
-        at_once = self._code_since + self._lock_delay
-        self._carrier_since = np.where(started, at_once, np.where(slipped, t_s, self._carrier_since))
+        self._carrier_since = np.where(started | slipped, t_s, self._carrier_since)
+        if began:
+            self._carrier_since = np.where(started, self._code_since + self._lock_delay, self._carrier_since)
         jump = np.floor(200.0 * chance[1]) - 100.0
         self._ambiguity += np.where(started | slipped, np.where(jump >= 0, jump + 1, jump), 0.0)
         self._code, self._carrier = code, carrier
