@@ -18,15 +18,16 @@ class GnssOptions:
     """One sigma of each error, in m unless said otherwise; 0 turns an error off.
 
     `nav` is a RINEX navigation file whose satellites fly instead of the nominal ones. Epochs come at `rate_hz` but
-    for the fraction `missing`; one tracked nothing below `mask_deg`. `cold` switches the receiver on at the start;
-    else it has been on for a minute.
+    for the fraction `missing`, at random; nothing below `mask_deg` is tracked. `cold` switches the receiver on at the
+    start; else it has been on for a minute.
 
     Satellites: `orbit` and `satellite_clock` against what they broadcast. Air: `ionosphere` and `troposphere` scale
-    the broadcast models' delays, the `…_residual` (at the zenith) is what no model tells. Receiver: `clock` scales the
-    random walk of its oscillator, `clock_drift_ppm` is its largest mean drift; `inter_system` is a constant delay of
-    each system; `code`, `phase` and `doppler` (m/s) are white noise at 45 dBHz; `multipath` and `carrier_multipath`
-    are correlated over `multipath_s` seconds; `slips` of each carrier in an hour at 45 dBHz, more when weak;
-    `half_cycle` leaves new carriers unresolved for some seconds.
+    the delays of Klobuchar's model, as it is broadcast, and of Saastamoinen's; the `…_residual`, for a satellite at the
+    zenith, is what neither tells. Receiver: `clock` scales the random walk of its oscillator, `clock_drift_ppm` is its
+    largest mean drift; `inter_system` is a constant delay of each system; `code`, `phase` and `doppler` (m/s) are white
+    noise at 45 dBHz; `multipath` and `carrier_multipath` are correlated over `multipath_s` seconds, and change from
+    half their size at the zenith to twice at the horizon; `slips` of each carrier in an hour at 45 dBHz, more when
+    weak; `half_cycle` leaves new carriers unresolved for some seconds.
 
     `outage` and `jamming` are seconds of the flight, such as 60-180 or 60-90,300-330: nothing is received, or C/N0
     falls by `jamming_db`. `fault` satellites, from `fault_start` s on, are late by `fault_bias` and by `fault_ramp`
