@@ -28,7 +28,52 @@ class TrackerSettings:
 
 
 @dataclass(frozen=True)
+class ImuSettings:
+    """Noise of the IMU as it flies, with what vibration adds; densities per √Hz in m/s² and rad/s.
+
+    `*_walk` are the random walks of the biases (m/s³, rad/s² per √Hz), `*_sigma` what they may be at the start, and
+    `*_step` how far they may move before measurements are integrated anew. After `max_gap_s` without a sample, and
+    out of range, the noise is `doubtful_*`. `gravity` m/s².
+    """
+
+    accel_noise: Annotated[float, Range(1e-6, 10.0)] = 0.01
+    gyro_noise: Annotated[float, Range(1e-7, 1.0)] = 0.0005
+    accel_bias_walk: Annotated[float, Range(1e-8, 1.0)] = 0.001
+    gyro_bias_walk: Annotated[float, Range(1e-9, 0.1)] = 2e-5
+    accel_bias_sigma: Annotated[float, Range(1e-4, 10.0)] = 0.1
+    gyro_bias_sigma: Annotated[float, Range(1e-5, 1.0)] = 0.02
+    accel_bias_step: Annotated[float, Range(1e-4, 10.0)] = 0.05
+    gyro_bias_step: Annotated[float, Range(1e-5, 1.0)] = 0.002
+    max_gap_s: Annotated[float, Range(0.001, 1.0)] = 0.03
+    doubtful_accel: Annotated[float, Range(0.01, 100.0)] = 0.5
+    doubtful_gyro: Annotated[float, Range(0.001, 10.0)] = 0.05
+    gravity: Annotated[float, Range(9.7, 9.9)] = 9.80665
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Settings of the sliding window; px of the full image.
+
+    A frame becomes a keyframe once points moved by `parallax_deg` beyond what turning does since the last one, fewer than
+    `overlap` of them are left, or after `longest_s`. A point needs `min_angle_deg` between its rays. Observations beyond `max_residual`
+    sigmas are outliers. Up to `anchored` points outlive the keyframes that saw them.
+    """
+
+    keyframes: Annotated[int, Range(3, 50)] = 10
+    parallax_deg: Annotated[float, Range(0.01, 45.0)] = 2.0
+    overlap: Annotated[float, Range(0.0, 1.0)] = 0.6
+    longest_s: Annotated[float, Range(0.1, 100.0)] = 3.0
+    pixel_sigma: Annotated[float, Range(0.05, 10.0)] = 1.0
+    min_angle_deg: Annotated[float, Range(0.05, 45.0)] = 1.0
+    max_residual: Annotated[float, Range(1.0, 100.0)] = 4.0
+    anchored: Annotated[int, Range(0, 200)] = 30
+    iterations: Annotated[int, Range(1, 50)] = 4
+
+
+@dataclass(frozen=True)
 class OdometrySettings:
     """Settings of the odometry."""
 
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    imu: ImuSettings = field(default_factory=ImuSettings)
+    window: WindowSettings = field(default_factory=WindowSettings)

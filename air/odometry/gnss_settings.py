@@ -1,0 +1,77 @@
+"""Settings of GNSS in the odometry, with defaults that work for an F9P on a multirotor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from common.config import Range
+
+Sigma = Annotated[float, Range(0.0, 1000.0)]
+Seconds = Annotated[float, Range(0.0, 1e5)]
+
+
+@dataclass(frozen=True)
+class GnssSelection:
+    """Which measurements are used.
+
+    Satellites above `elevation_mask_deg`, with `min_cn0` dBHz, seen for `min_seen_s`; carrier phase only when
+    `carrier`, after `min_lock_s` of lock. The receiver's own sigmas must be below `max_sigma_code` m and
+    `max_sigma_rate` m/s. A pseudorange that moves by `max_jump` m against the Doppler is left out. A carrier slipped
+    when it departs from its Doppler by `max_slip` m, or one band from the other by `max_split` m.
+    """
+
+    elevation_mask_deg: Annotated[float, Range(0.0, 60.0)] = 10.0
+    min_cn0: Annotated[float, Range(0.0, 60.0)] = 28.0
+    carrier: bool = True
+    min_seen_s: Seconds = 1.0
+    min_lock_s: Seconds = 1.0
+    max_sigma_code: Sigma = 50.0
+    max_sigma_rate: Sigma = 5.0
+    max_jump: Sigma = 12.0
+    max_slip: Sigma = 0.12
+    max_split: Sigma = 0.05
+
+
+@dataclass(frozen=True)
+class GnssNoise:
+    """One sigma of each error, m unless said otherwise, at 45 dBHz and in the zenith, where that matters.
+
+    `code`, `carrier`, `rate` (m/s) are white. Of each satellite: `multipath` of the code, correlated over
+    `multipath_s`, as its elevation lets it grow; `orbit` with the satellite's clock, and `ionosphere` and
+    `troposphere` beyond the models, all together over `slow_s`; `drift` m/s is how fast these change, which Doppler
+    and carrier see; `ambiguity_walk` m/√s is what a carrier free of the ionosphere still drifts. `system_walk` m/√s is
+    that of the delay between two systems. Differences to a base station keep the share `differential` of the slow
+    errors. Residuals beyond `robust` sigmas lose weight.
+    """
+
+    code: Sigma = 0.4
+    carrier: Sigma = 0.004
+    rate: Sigma = 0.04
+    multipath: Sigma = 2.5
+    multipath_s: Seconds = 60.0
+    orbit: Sigma = 0.8
+    ionosphere: Sigma = 1.0
+    troposphere: Sigma = 0.15
+    slow_s: Seconds = 1800.0
+    drift: Sigma = 0.003
+    drift_s: Seconds = 600.0
+    ambiguity_walk: Sigma = 0.005
+    system_walk: Sigma = 0.01
+    differential: Annotated[float, Range(0.0, 1.0)] = 0.05
+    robust: Annotated[float, Range(1.0, 100.0)] = 4.0
+
+
+@dataclass(frozen=True)
+class GnssSettings:
+    """Settings of GNSS in the odometry.
+
+    `p_body_antenna` (x, y, z) m is the lever arm. Biases of satellites stay the same for `node_s`. Epochs older than
+    `max_age_s` without a position of their own are not used.
+    """
+
+    p_body_antenna: tuple[float, ...] = (0.0, 0.0, 0.0)
+    node_s: Seconds = 2.0
+    max_age_s: Seconds = 60.0
+    selection: GnssSelection = field(default_factory=GnssSelection)
+    noise: GnssNoise = field(default_factory=GnssNoise)
