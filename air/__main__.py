@@ -79,6 +79,13 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--quiet", action="store_true", help="no progress bar")
     replay.set_defaults(run=_replay)
 
+    simulate = commands.add_parser("simulate", help="record a simulated flight as fast as it computes")
+    simulate.add_argument("source", metavar="URL", help="e.g. sim:plain?seed=1&duration=300&gnss.multipath=0")
+    simulate.add_argument("--out", type=Path, required=True, metavar="F.mcap", help="the recording")
+    simulate.add_argument("--truth", type=Path, metavar="DIR", help="folder for the truth as files")
+    simulate.add_argument("--quiet", action="store_true", help="no progress bar")
+    simulate.set_defaults(run=_simulate)
+
     check = commands.add_parser("check", help="find the devices and show how each is doing")
     check.add_argument("--once", action="store_true", help="print once and end, for scripts")
     check.add_argument("--json", action="store_true", help="for programs; implies --once")
@@ -86,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_calibrate(commands.add_parser("calibrate", help="calibrate a camera, or a camera against the IMU"))
 
-    for command in (check, process, run, record, replay):
+    for command in (check, process, run, record, replay, simulate):
         command.add_argument("--config", type=Path, metavar="FILE", help="TOML file; without it the defaults hold")
     return parser
 
@@ -189,6 +196,15 @@ def _record(args: argparse.Namespace) -> int:
 
     log.setup()
     return record(load(args.config, AirConfig), args.out)
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from air.config import AirConfig
+    from air.simulate import simulate
+
+    count = simulate(load(args.config, AirConfig), args.source, args.out, args.truth, args.quiet)
+    print(f"{count} messages: {args.out}")
+    return 0
 
 
 def _replay(args: argparse.Namespace) -> int:

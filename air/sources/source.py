@@ -112,9 +112,13 @@ def _open_photos(url: str, rest: str) -> Source:
 
 
 def _open_simulated(url: str, rest: str) -> Source:
-    from air.sources.simulated.survey import open_survey
+    if rest.partition("?")[0] == "survey":
+        from air.sources.simulated.survey import open_survey
 
-    return open_survey(url, rest)
+        return open_survey(url, rest)
+    from air.sources.simulated.flown import open_flight
+
+    return open_flight(url, rest)
 
 
 def _importer(module: str, function: str) -> Callable[[str, str], Source]:

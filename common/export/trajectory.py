@@ -45,10 +45,11 @@ def write_tum(path: Path, t_ns: Sequence[int] | I64, poses: Sequence[SE3]) -> No
 
     Source: J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems (IROS 2012).
     """
-    path.write_text("".join(map(_tum_line, t_ns, poses)), encoding="ascii")
+    path.write_text("".join(map(tum_line, t_ns, poses)), encoding="ascii")
 
 
-def _tum_line(t_ns: int, pose: SE3) -> str:
+def tum_line(t_ns: int, pose: SE3) -> str:
+    """A pose at GPST `t_ns` as a line of a TUM file."""
     seconds, nanoseconds = divmod(int(t_ns), 1_000_000_000)
     w, x, y, z = pose.wxyz
     numbers = " ".join(f"{value:.9f}" for value in (*pose.t, x, y, z, w))

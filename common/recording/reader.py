@@ -85,10 +85,13 @@ class Recording:
         """When the last message was logged, GPST ns; 0 when there is none."""
         return max((chunk.last_ns for chunk in self.chunks), default=0)
 
-    def messages(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Recorded]:
+    def messages(
+        self, start_ns: int | None = None, end_ns: int | None = None, encoding: str = "msgpack"
+    ) -> Iterator[Recorded]:
         """The messages logged from `start_ns` to before `end_ns`, in the order in which they came.
 
-        Chunks outside are not unpacked, unless the file has lost its index, which tells the channels.
+        Those of another encoding are passed over: "json" gives the readable copies and the tables. Chunks outside are
+        not unpacked, unless the file has lost its index, which tells the channels.
         """
         start = 0 if start_ns is None else start_ns
         end = FOREVER_NS if end_ns is None else end_ns
@@ -107,7 +110,7 @@ class Recording:
                 if channel is None:
                     self._tell(f"a channel's name is lost: messages of number {channel_id} are skipped")
                     continue
-                if channel.message_encoding != "msgpack":
+                if channel.message_encoding != encoding:
                     continue
                 missing = count - last_count.get(channel_id, 0 if start_ns is None else count - 1) - 1
                 last_count[channel_id] = count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import BinaryIO
 
@@ -50,6 +51,18 @@ class RecordingWriter:
                 topic = "/".join(["", parsed.vehicle, parsed.stream.name, *parsed.rest])
                 self._write(topic, "json", parsed.stream, text, log_ns)
 
+    def add_row(self, topic: str, values: Mapping[str, float | int | str], log_ns: int) -> None:
+        """Append a row of a table as JSON, under a topic that is no key of a stream: no reader of streams sees it.
+
+        All rows of a topic have the same names. Raises OSError.
+        """
+        if topic not in self._channels:
+            types = {name: {"type": "string" if isinstance(value, str) else "number"} for name, value in values.items()}
+            text = json.dumps({"title": topic, "type": "object", "properties": types}).encode()
+            schema = self._mcap.register_schema(topic, "jsonschema", text)
+            self._channels[topic] = self._mcap.register_channel(topic, "json", schema)
+        self._add(self._channels[topic], json.dumps(values).encode(), log_ns)
+
     def flush(self) -> None:
         """Hand everything so far to the file as a whole chunk. Raises OSError."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
@@ -59,7 +72,9 @@ class RecordingWriter:
         self._mcap.finish()  # type: ignore[no-untyped-call]
 
     def _write(self, topic: str, encoding: str, stream: Stream, data: bytes, log_ns: int) -> None:
-        channel = self._channels.get(topic) or self._open_channel(topic, encoding, stream)
+        self._add(self._channels.get(topic) or self._open_channel(topic, encoding, stream), data, log_ns)
+
+    def _add(self, channel: int, data: bytes, log_ns: int) -> None:
         self._counts[channel] += 1
         self._mcap.add_message(channel, log_ns, data, log_ns, self._counts[channel])
 

@@ -1,0 +1,127 @@
+"""A simulated flight as a source, opened as `sim:playground?seed=1&duration=300&…`: bytes through the real drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from air.sensors.driver import Driver, TimeScale
+from air.sources.simulated.aircraft import Aircraft, Arrival
+from air.sources.simulated.flight_truth import FlightTruth
+from air.sources.simulated.ground import SITES, open_ground
+from air.sources.simulated.known import Known, known_of
+from air.sources.simulated.options import parse_options
+from air.sources.source import Problem
+from air.timing import Timebase
+from common.errors import ConfigError, SourceError
+from common.measurements import CameraFrame, Measurement, RawBytes
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What one arrival at the host, at the true time `t_s`, tells: bytes of `device`, and the measurements in them."""
+
+    t_s: float
+    device: str
+    size: int
+    measurements: list[Measurement]
+
+
+class SimulatedFlight:
+    """The measurements of a simulated flight, as the host on board knows them: late, and in its own estimate of time.
+
+    Everything is generated while it is read, the same at every iteration. `RawBytes` carry the time of arrival by the
+    computer's own clock until the receiver's time is known; the rest is held back until then. The base station's
+    measurements come as those of the device `base`, in its own receiver's time.
+    """
+
+    def __init__(self, url: str, aircraft: Aircraft):
+        self._url = url
+        self.aircraft = aircraft
+        self._drivers: dict[str, Driver] = {}
+
+    @property
+    def url(self) -> str:
+        """The URL that opened the flight."""
+        return self._url
+
+    @cached_property
+    def truth(self) -> FlightTruth:
+        """All that an estimator must not know."""
+        return FlightTruth(self.aircraft)
+
+    @cached_property
+    def known(self) -> Known:
+        """What was calibrated before the flight: where the sensors sit, nearly, and how late they are."""
+        return known_of(self.aircraft)
+
+    @property
+    def problems(self) -> Sequence[Problem]:
+        """What the drivers dropped and missed so far in the latest iteration."""
+        found = []
+        for name, driver in self._drivers.items():
+            counts = driver.counts
+            if counts.dropped_bytes or counts.refused:
+                found.append(Problem(name, f"{counts.dropped_bytes} bytes dropped, {counts.refused} frames refused"))
+            if counts.missing:
+                found.append(Problem(name, f"frames that the device numbered and that never came: {counts.missing}"))
+        return found
+
+    def __iter__(self) -> Iterator[Measurement]:
+        for heard in self.heard():
+            yield from heard.measurements
+
+    def heard(self) -> Iterator[Heard]:
+        """The flight, arrival by arrival."""
+        self._drivers = self.aircraft.drivers()
+        host = _Host(self._drivers, Timebase(self.known.delays_s), self.aircraft)
+        for arrival in self.aircraft.arrivals():
+            size = 0 if isinstance(arrival.data, CameraFrame) else len(arrival.data)
+            yield Heard(arrival.t_s, arrival.device, size, list(host.take(arrival)))
+
+
+class _Host:
+    """The computer on board: what its drivers make of the bytes, stamped as well as it knows the time."""
+
+    def __init__(self, drivers: dict[str, Driver], timebase: Timebase, aircraft: Aircraft):
+        self._drivers, self._timebase = drivers, timebase
+        self._aircraft = aircraft
+        self._switched_on_ns = aircraft.start_ns - aircraft.host_ns(0.0)
+
+    def take(self, arrival: Arrival) -> Iterator[Measurement]:
+        """What an arrival tells."""
+        host_ns, device = self._aircraft.host_ns(arrival.t_s), arrival.device
+        found: list[Measurement]
+        if isinstance(arrival.data, CameraFrame):
+            found, scale = [arrival.data], TimeScale.DEVICE
+        else:
+            yield RawBytes(self._time_of_day_ns(host_ns), device, arrival.data)
+            driver = self._drivers[device]
+            found, scale = driver.feed(arrival.data, host_ns), driver.scale
+        for measurement in found:
+            if device == "base":  # far away: it tells nothing about the clocks on board
+                yield measurement
+                continue
+            stamped = self._timebase.restamp(measurement, device, scale, host_ns)
+            if stamped is not None:
+                yield stamped
+        yield from self._timebase.states(host_ns)
+
+    def _time_of_day_ns(self, host_ns: int) -> int:
+        """GNSS time; as long as it is unknown, that of the computer's clock, which was set at the start."""
+        known_ns = self._timebase.gnss_ns(host_ns)
+        return self._switched_on_ns + host_ns if known_ns is None else known_ns
+
+
+def open_flight(url: str, rest: str) -> SimulatedFlight:
+    """The flight of a URL `sim:SITE?key=value&…`. Raises SourceError for an unknown site or option."""
+    name, _, query = rest.partition("?")
+    if name not in SITES:
+        raise SourceError(f"source {url!r}: there is no site {name!r}; there are survey, {', '.join(SITES)}")
+    options = parse_options(url, query)
+    try:
+        ground, datum = open_ground(name, options.seed)
+        return SimulatedFlight(url, Aircraft(options, ground, datum))
+    except (ConfigError, SourceError) as error:
+        raise SourceError(f"source {url!r}: {error}") from error

@@ -1,0 +1,228 @@
+"""The assembled simulator: options by URL, devices on the host's clock, a recording, and the truth out of reach."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from air.config import AirConfig
+from air.info import summarize
+from air.simulate import record_flight, simulate
+from air.sources.simulated.aircraft import READ_BYTES
+from air.sources.simulated.flown import SimulatedFlight
+from air.sources.simulated.imu import ImuOptions
+from air.sources.source import open_source
+from common.errors import ExportError, SourceError
+from common.export.trajectory import read_tum
+from common.measurements import (
+    ClockState,
+    GnssEpoch,
+    ImuSample,
+    KeplerEphemeris,
+    Measurement,
+    RawBytes,
+    ReceiverSolution,
+    VehicleState,
+)
+from common.recording.reader import Recording
+from common.wire import encode
+
+SHORT = "sim:plain?duration=6&flight.start=air"
+
+
+def flight(url: str) -> SimulatedFlight:
+    found = open_source(url)
+    assert isinstance(found, SimulatedFlight)
+    return found
+
+
+def of(kind: type, measurements: list[Measurement]) -> list:
+    return [m for m in measurements if isinstance(m, kind)]
+
+
+# Options
+
+
+def test_the_url_sets_every_part() -> None:
+    options = flight(
+        "sim:plain?seed=3&duration=5&imu=perfect&imu.vibration=1&gnss.multipath=0&gnss.outage=1-2&base=off"
+        "&flight.mission=stand&clock=perfect&extrinsics.antenna_m=0&mavlink.lost=0.5"
+    ).aircraft.options
+    assert (options.seed, options.duration, options.off) == (3, 5.0, ("base",))
+    assert (options.imu.vibration, options.imu.accel_noise_ug, options.imu.bits) == (1.0, 0.0, 0)
+    assert (options.gnss.multipath, options.gnss.outage, options.base.rate_hz) == (0.0, "1-2", 1.0)
+    assert (options.flight.mission, options.clock.drift_ppm) == ("stand", 0.0)
+    assert (options.extrinsics.antenna_m, options.mavlink.lost) == (0.0, 0.5)
+
+
+def test_the_order_of_options_does_not_matter() -> None:
+    one, other = flight("sim:plain?imu.vibration=1&imu=perfect"), flight("sim:plain?imu=perfect&imu.vibration=1")
+    assert one.aircraft.options == other.aircraft.options
+    assert one.aircraft.options.imu == ImuOptions(**{**vars(ImuOptions.perfect()), "vibration": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("sim:race", "there is no site 'race'; there are survey, plain"),
+        ("sim:plain?gnss.multipaht=0", "gnss.multipaht is not a setting; did you mean multipath?"),
+        ("sim:plain?gnss.multipath=-1", "gnss.multipath is -1.0; allowed: 0.0 to 1000.0"),
+        ("sim:plain?gnss.multipath=much", "gnss.multipath is 'much'; allowed: a number"),
+        ("sim:plain?gnss.multipath=nan", "gnss.multipath is nan; allowed: a number"),
+        ("sim:plain?gnss.outage=9-3", "option 'outage' is '9-3', must be seconds of the flight"),
+        ("sim:plain?gnss.systems=X", "option 'systems' is 'X', must be some of GREC"),
+        ("sim:plain?colour=red", "colour is not a setting"),
+        ("sim:plain?duration=0", "duration is 0.0; allowed: 1.0 to 7200.0"),
+        ("sim:plain?seed=1.5", "seed is 1.5; allowed: a whole number"),
+        ("sim:plain?seed=1&seed=2", "option 'seed' is given twice"),
+        ("sim:plain?imu=good", "imu is 'good'; allowed: perfect or off or one of its options"),
+        ("sim:plain?flight=off", "flight is 'off'; allowed: one of its options: flight.mission"),
+        ("sim:plain?off=imu", "off is 'imu'; allowed: imu=off"),
+        ("sim:plain?flight.mission=dance", "flight.mission is 'dance'; allowed: 'survey', 'hover', 'stand'"),
+        ("sim:plain?flight.waypoints=1,2", "waypoints has '1,2'"),
+        ("sim:plain?base.jamming=x", "option 'jamming' is 'x'"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(url: str, said: str) -> None:
+    with pytest.raises(SourceError) as refused:
+        open_source(url)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+# Devices
+
+
+def test_every_device_speaks_through_its_driver() -> None:
+    source = flight("sim:plain?duration=40&gnss.missing=0&mavlink.lost=0&flight.start=air")
+    measurements = list(source)
+    assert source.problems == []
+    counts = Counter(type(m).__name__ for m in measurements)
+    assert 36 * 200 <= counts["ImuSample"] <= 40 * 200  # the first two seconds find the time
+    assert sum(m.receiver == "gnss" for m in of(GnssEpoch, measurements)) == pytest.approx(400, abs=2)
+    assert sum(m.receiver == "base" for m in of(GnssEpoch, measurements)) == pytest.approx(40, abs=1)
+    assert {m.device for m in of(RawBytes, measurements)} == {"imu", "gnss", "base", "mavlink"}
+    assert {m.device for m in of(ClockState, measurements)} == {"gnss", "imu"}
+    assert len(of(VehicleState, measurements)) > 250
+    assert len({m.satellite for m in of(KeplerEphemeris, measurements)}) > 20
+    assert max(len(m.data) for m in of(RawBytes, measurements)) <= READ_BYTES
+    # Arrivals run forwards once time is known.
+    stamps = [m.t_ns for m in of(RawBytes, measurements)][2000:]
+    assert all(later - earlier > -2e6 for earlier, later in pairwise(stamps))
+
+
+def test_a_device_that_is_off_says_nothing() -> None:
+    measurements = list(flight("sim:plain?duration=4&imu=off&base=off&mavlink=off"))
+    assert {m.device for m in of(RawBytes, measurements)} == {"gnss"}
+
+
+def test_stamps_are_true_to_a_millisecond_from_jittery_arrivals() -> None:
+    """The longest path from the antenna to the host depends on how many signals an epoch holds: 0.3 ms for each."""
+    source = flight("sim:plain?duration=40&gnss.missing=0")
+    true_s = np.concatenate([batch.t_s for batch in source.aircraft.imu().batches()])
+    told_s = np.array([m.t_ns - source.aircraft.start_ns for m in of(ImuSample, list(source))]) * 1e-9
+    error_s = told_s - true_s[len(true_s) - len(told_s) - 1 : -1]  # the last one is on its way when the flight ends
+    assert np.abs(error_s[10 * 200 :]).max() < 1.5e-3
+
+
+def test_perfect_devices_on_perfect_clocks_tell_the_truth() -> None:
+    source = flight("sim:plain?duration=6&imu=perfect&clock=perfect&gnss=perfect&flight.start=air")
+    samples = of(ImuSample, list(source))
+    t_s = np.array([(m.t_ns - source.aircraft.start_ns) * 1e-9 for m in samples])
+    truth = source.aircraft.trajectory.at(t_s)
+    # The earth turns by 7e-5 rad/s, and a mean over 5 ms is not the value in its middle.
+    np.testing.assert_allclose([m.gyro for m in samples], truth.omega_body, atol=2e-3)
+
+
+# The truth
+
+
+def test_the_truth_is_written_and_agrees_with_the_trajectory(tmp_path: Path) -> None:
+    source = flight(SHORT)
+    source.truth.write(tmp_path / "truth")
+    tum = read_tum(tmp_path / "truth" / "trajectory.tum")
+    assert len(tum.t_ns) == 6 * 200 + 1
+    assert set(np.diff(tum.t_ns).tolist()) == {5_000_000}
+    motion = source.aircraft.trajectory.at((tum.t_ns - source.aircraft.start_ns) * 1e-9)
+    np.testing.assert_allclose(tum.positions, motion.p_world, atol=1e-8)
+    np.testing.assert_allclose([pose.R for pose in tum.poses], motion.R_world_body, atol=1e-7)
+    names = {path.name for path in (tmp_path / "truth").iterdir()}
+    assert names == {
+        *("trajectory.tum", "state.csv", "clocks.csv", "satellites.csv", "flight.json", "datum.json"),
+    }
+    table = np.genfromtxt(tmp_path / "truth" / "clocks.csv", delimiter=",", names=True)
+    assert len(table) == 7
+    host_s = source.aircraft.host_ns(6.0) * 1e-9
+    assert table["host_s"][-1] == pytest.approx(host_s, abs=1e-6)
+
+
+def test_the_truth_changes_no_byte_of_what_is_measured() -> None:
+    """A source whose truth nobody can ask gives the same bytes; so does the recording without the truth's channels."""
+
+    class Blind(SimulatedFlight):
+        @property
+        def truth(self) -> None:  # type: ignore[override]
+            raise AssertionError("somebody asked for the truth")
+
+    seeing = flight(SHORT)
+    blind = Blind(SHORT, seeing.aircraft)
+    assert [encode(m) for m in blind] == [encode(m) for m in seeing]
+
+
+def test_no_reader_of_a_recording_comes_upon_the_truth(tmp_path: Path) -> None:
+    paths = {truth: tmp_path / f"truth-{truth}.mcap" for truth in (True, False)}
+    for truth, path in paths.items():
+        with path.open("wb") as file:
+            record_flight(flight(SHORT), file, AirConfig(), truth)
+    whole, bare = (list(Recording(path).messages()) for path in paths.values())
+    assert whole == bare
+    read = [[encode(m) for m in open_source(str(path))] for path in paths.values()]
+    assert read[0] == read[1] == [encode(m) for m in flight(SHORT)]
+    tables = Counter(r.key for r in Recording(paths[True]).messages(encoding="json") if r.key.startswith("truth/"))
+    assert (tables["truth/state"], tables["truth/clocks"]) == (6 * 200 + 1, 7)
+    assert tables["truth/satellites"] > 6 * 30
+    assert open_source(str(paths[True])).truth is None
+
+
+# Recordings
+
+
+def test_the_same_url_gives_the_same_recording() -> None:
+    """Written at different times of day, by sources that were opened anew."""
+
+    def digest() -> str:
+        file = io.BytesIO()
+        record_flight(flight(SHORT), file, AirConfig())
+        return hashlib.sha256(file.getvalue()).hexdigest()
+
+    assert digest() == digest()
+
+
+def test_simulate_records_a_flight_and_never_overwrites(tmp_path: Path) -> None:
+    out = tmp_path / "flight.mcap"
+    count = simulate(AirConfig(), SHORT, out, tmp_path / "truth")
+    assert count == len(list(flight(SHORT)))
+    assert Recording(out).about["source"] == SHORT
+    summary = summarize(open_source(str(out)), iter(open_source(str(out))))
+    rates = {stream.name: stream.rate_hz for stream in summary.streams}
+    assert rates["imu"] == pytest.approx(200, rel=0.01)
+    assert (tmp_path / "flight.calibration" / "aircraft.toml").exists()
+    assert (tmp_path / "truth" / "trajectory.tum").exists()
+    with pytest.raises(ExportError, match="is there already"):
+        simulate(AirConfig(), SHORT, out)
+    with pytest.raises(SourceError, match="no simulated flight"):
+        simulate(AirConfig(), "sim:survey", tmp_path / "other.mcap")
+
+
+def test_the_receiver_finds_its_place() -> None:
+    source = flight("sim:plain?duration=20&flight.mission=stand")
+    last = [m for m in source if isinstance(m, ReceiverSolution) and m.receiver == "gnss"][-1]
+    datum = source.aircraft.datum
+    assert last.latitude_deg == pytest.approx(datum.latitude_deg, abs=1e-4)
+    assert last.height == pytest.approx(datum.height, abs=15)
