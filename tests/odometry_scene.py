@@ -80,7 +80,9 @@ class Scene:
         row_dt_s = np.zeros(len(rows))
         if self.line_time_s and len(rows):
             row_dt_s = (uv[rows, 1] - CAMERA.cy) * self.line_time_s
-            moved = [self.T_world_cam(t_s + dt).inverse().apply(self.points[j]) for j, dt in zip(rows, row_dt_s)]
+            moved = [
+                self.T_world_cam(t_s + dt).inverse().apply(self.points[j]) for j, dt in zip(rows, row_dt_s, strict=True)
+            ]
             uv[rows] = CAMERA.project(np.array(moved))
         uv = uv[rows].reshape(-1, 2) + self.noise_px * self._rng.standard_normal((len(rows), 2))
         rays = CAMERA.rays(uv)

@@ -41,7 +41,7 @@ class ImuSettings:
     accel_bias_walk: Annotated[float, Range(1e-8, 1.0)] = 0.001
     gyro_bias_walk: Annotated[float, Range(1e-9, 0.1)] = 2e-5
     accel_bias_sigma: Annotated[float, Range(1e-4, 10.0)] = 0.1
-    gyro_bias_sigma: Annotated[float, Range(1e-5, 1.0)] = 0.02
+    gyro_bias_sigma: Annotated[float, Range(1e-5, 1.0)] = 0.05
     accel_bias_step: Annotated[float, Range(1e-4, 10.0)] = 0.05
     gyro_bias_step: Annotated[float, Range(1e-5, 1.0)] = 0.002
     max_gap_s: Annotated[float, Range(0.001, 1.0)] = 0.03
@@ -54,9 +54,9 @@ class ImuSettings:
 class WindowSettings:
     """Settings of the sliding window; px of the full image.
 
-    A frame becomes a keyframe once points moved by `parallax_deg` beyond what turning does since the last one, fewer than
-    `overlap` of them are left, or after `longest_s`. A point needs `min_angle_deg` between its rays. Observations beyond `max_residual`
-    sigmas are outliers. Up to `anchored` points outlive the keyframes that saw them.
+    A frame becomes a keyframe once points moved by `parallax_deg` beyond what turning does since the last one, fewer
+    than `overlap` of them are left, or after `longest_s`. A point needs `min_angle_deg` between its rays. Observations
+    beyond `max_residual` sigmas are outliers. Up to `anchored` points outlive the keyframes that saw them.
     """
 
     keyframes: Annotated[int, Range(3, 50)] = 10
@@ -71,9 +71,29 @@ class WindowSettings:
 
 
 @dataclass(frozen=True)
+class InitializationSettings:
+    """When the odometry may begin.
+
+    At rest: after `still_s` in which accelerations and rates have standard deviations below `still_accel` m/s² and
+    `still_gyro` rad/s, and the image moves by less than `still_px`. In motion: from `frames` of the last `span_s` at
+    most, between which points moved by `parallax_deg`, when the adjustment knows the scale within `scale_sigma`.
+    """
+
+    still_s: Annotated[float, Range(0.2, 60.0)] = 1.0
+    still_accel: Annotated[float, Range(0.001, 10.0)] = 0.15
+    still_gyro: Annotated[float, Range(0.0001, 1.0)] = 0.01
+    still_px: Annotated[float, Range(0.1, 20.0)] = 1.0
+    frames: Annotated[int, Range(5, 40)] = 10
+    span_s: Annotated[float, Range(0.5, 20.0)] = 3.0
+    parallax_deg: Annotated[float, Range(0.1, 45.0)] = 3.0
+    scale_sigma: Annotated[float, Range(0.001, 1.0)] = 0.1
+
+
+@dataclass(frozen=True)
 class OdometrySettings:
     """Settings of the odometry."""
 
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     imu: ImuSettings = field(default_factory=ImuSettings)
+    initialization: InitializationSettings = field(default_factory=InitializationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)

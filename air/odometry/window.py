@@ -25,6 +25,8 @@ from common.se3 import SE3
 noise = gtsam.noiseModel
 HUBER = 1.345
 TOLERANCE = 1e-4
+WEAK = 100.0
+"""Sigma of the prior of a point, in distances of the point."""
 TRIALS = 5
 """How many undetermined points are removed before a solution is given up."""
 STILL_SPEED, STILL_TURN, STILL_SHIFT = 0.02, 0.002, 0.005
@@ -266,9 +268,9 @@ class Window:
             graph.add(gtsam.BetweenFactorPose3(X(a.k), X(b.k), gtsam.Pose3(), stay))
 
     def _weak(self, p_world: F64) -> gtsam.noiseModel.Base:
-        """So little that it only keeps the system regular: the distance of the point."""
+        """So little that it only keeps the system regular: many such priors together must not hold the scale."""
         distance = float(np.linalg.norm(p_world - self.values.atPose3(X(self.frames[-1].k)).translation()))
-        return noise.Isotropic.Sigma(3, max(distance, 1e-3))
+        return noise.Isotropic.Sigma(3, WEAK * max(distance, 1e-3))
 
     def _ordering(self) -> gtsam.Ordering:
         """Points first, then a companion's keys, then the frames; the newest pose last."""
