@@ -86,6 +86,14 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--quiet", action="store_true", help="no progress bar")
     simulate.set_defaults(run=_simulate)
 
+    convert = commands.add_parser("convert", help="write a flight in the formats of other programs")
+    convert.add_argument("source", metavar="SOURCE", help="with IMU, camera or GNSS: F.mcap, sim:plain?seed=1, bag:F")
+    convert.add_argument("--to", required=True, metavar="euroc+rinex", help="formats: euroc, rinex, or both")
+    convert.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    convert.add_argument("--calibration", type=Path, metavar="DIR", help="what simulate wrote beside its recording")
+    convert.add_argument("--quiet", action="store_true", help="no progress bar")
+    convert.set_defaults(run=_convert)
+
     check = commands.add_parser("check", help="find the devices and show how each is doing")
     check.add_argument("--once", action="store_true", help="print once and end, for scripts")
     check.add_argument("--json", action="store_true", help="for programs; implies --once")
@@ -204,6 +212,16 @@ def _simulate(args: argparse.Namespace) -> int:
 
     count = simulate(load(args.config, AirConfig), args.source, args.out, args.truth, args.quiet)
     print(f"{count} messages: {args.out}")
+    return 0
+
+
+def _convert(args: argparse.Namespace) -> int:
+    from air.conversion.convert import convert
+
+    done = convert(args.source, args.to, args.out, args.calibration, args.quiet)
+    print(f"{', '.join(f'{count} {kind}' for kind, count in done.counts.items() if count)}: {args.out}")
+    for problem in done.problems:
+        print(f"{problem.name}: {problem.text}", file=sys.stderr)
     return 0
 
 

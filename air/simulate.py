@@ -13,7 +13,8 @@ from air.config import AirConfig
 from air.gnss.calendar import to_calendar
 from air.recorder import CameraPacker
 from air.sensing import STREAM_OF
-from air.sources.simulated.flight_truth import Row
+from air.sources.known import ENDING
+from air.sources.simulated.flight_truth import TRUTH, Row
 from air.sources.simulated.flown import SimulatedFlight
 from air.sources.source import open_source
 from common.clock import GPST_MINUS_UTC_NS
@@ -22,9 +23,6 @@ from common.keys import message_key
 from common.measurements import CameraFrame, Measurement
 from common.recording.writer import RecordingWriter
 from common.wire import encode
-
-TRUTH = "truth"
-"""What stands before the names of the truth's channels."""
 
 
 def simulate(config: AirConfig, url: str, out: Path, truth: Path | None = None, quiet: bool = True) -> int:
@@ -39,7 +37,7 @@ def simulate(config: AirConfig, url: str, out: Path, truth: Path | None = None, 
     try:
         with out.open("xb") as file:
             count = record_flight(flight, file, config, quiet=quiet)
-        flight.known.write(out.with_suffix(".calibration"))
+        flight.known.write(out.with_suffix(ENDING))
         if truth is not None:
             flight.truth.write(truth)
     except FileExistsError as error:

@@ -36,6 +36,11 @@ class RecordedSource:
         return self._url
 
     @property
+    def path(self) -> Path:
+        """The file."""
+        return self._recording.path
+
+    @property
     def truth(self) -> Truth | None:
         """None: nobody knows the truth of a real flight."""
         return None

@@ -21,8 +21,11 @@ from air.sources.simulated.gnss import Observed
 from common.errors import ExportError
 from common.export.datum import write_datum
 from common.export.trajectory import tum_line
+from common.recording.reader import Recording
 from common.se3 import SE3, matrix_to_quaternion
 
+TRUTH = "truth"
+"""What stands before the names of the tables in a recording."""
 RATE_HZ = 200
 STATE, CLOCKS, SATELLITES = "state", "clocks", "satellites"
 _STEP_NS = 1_000_000_000 // RATE_HZ
@@ -136,6 +139,13 @@ def write_rows(folder: Path, rows: Iterable[Row]) -> None:
             writers[row.table].writerow(row.values)
             if row.table == STATE:
                 tum.write(tum_line(row.t_ns, pose_of(row)))
+
+
+def recorded_states(path: Path) -> Iterator[Row]:
+    """The states of the truth in a recording of a simulated flight; none in any other. Raises SourceError."""
+    for recorded in Recording(path).messages(encoding="json"):
+        if recorded.key == f"{TRUTH}/{STATE}":
+            yield Row(recorded.log_ns, STATE, json.loads(recorded.payload))
 
 
 def pose_of(row: Row) -> SE3:

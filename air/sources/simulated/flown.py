@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from air.sensors.driver import Driver, TimeScale
+from air.sources.known import Known
 from air.sources.simulated.aircraft import Aircraft, Arrival
 from air.sources.simulated.flight_truth import FlightTruth
 from air.sources.simulated.ground import SITES, open_ground
-from air.sources.simulated.known import Known, known_of
+from air.sources.simulated.known import known_of
 from air.sources.simulated.options import parse_options
 from air.sources.source import Problem
 from air.timing import Timebase
