@@ -140,7 +140,7 @@ def _run(args: argparse.Namespace) -> int:
     log.setup()
     config = load(args.config, AirConfig)
     url = args.source or config.source
-    if url.startswith("live:"):
+    if url.startswith(("live:", "sim:")) and not url.startswith("sim:survey"):
         from air.sensing import sense
 
         return sense(config, url)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+from collections.abc import Iterator
+from typing import Protocol
 
 from air.config import AirConfig
+from air.devices.status import DeviceStatus
 from air.sources.live import Live
 from air.sources.source import open_source
 from common.bus import Bus, ZenohBus
@@ -26,14 +29,31 @@ STREAM_OF: dict[type[Message], Stream] = {stream.message: stream for stream in S
 """Where each kind of measurement goes; corrections are no measurement of ours."""
 
 
-def sense(config: AirConfig, url: str) -> int:
-    """Exit code 0 after SIGINT or SIGTERM; until then publishes what the devices of a `live:` source measure.
+class Devices(Protocol):
+    """Devices that are read until they are closed: those on board, or simulated ones."""
 
-    `live:` alone takes the devices of `config`. Raises SourceError, ConfigError and BusError.
+    def __iter__(self) -> Iterator[Measurement]: ...
+
+    def statuses(self) -> list[DeviceStatus]:
+        """How each device is doing now."""
+        ...
+
+    def correct(self, data: bytes) -> None:
+        """Pass corrections from the ground on to the receiver."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the devices; the iteration ends."""
+        ...
+
+
+def sense(config: AirConfig, url: str) -> int:
+    """Exit code 0 after SIGINT or SIGTERM, or when a simulated flight ends; until then publishes what devices measure.
+
+    `live:` alone takes the devices of `config`; a simulated flight, `sim:plain` and the like, is flown at the pace of
+    time. Raises SourceError, ConfigError and BusError.
     """
-    live = Live(url, config.devices) if url == "live:" else open_source(url)
-    if not isinstance(live, Live):
-        raise SourceError(f"source {url!r} is no live source; use live: or live:FILE.toml")
+    live = _open(config, url)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: live.close())
     bus = ZenohBus(config.bus)
@@ -46,10 +66,23 @@ def sense(config: AirConfig, url: str) -> int:
     return 0
 
 
+def _open(config: AirConfig, url: str) -> Devices:
+    source = Live(url, config.devices) if url == "live:" else open_source(url)
+    if isinstance(source, Live):
+        return source
+    if url.startswith("sim:"):
+        from air.sources.simulated.flown import SimulatedFlight  # brings a compiler along
+        from air.sources.simulated.live import LiveFlight
+
+        if isinstance(source, SimulatedFlight):
+            return LiveFlight(source)
+    raise SourceError(f"source {url!r} is no live source; use live:, live:FILE.toml, or a simulated flight")
+
+
 class Sensing:
     """Source → bus, until the source is closed."""
 
-    def __init__(self, live: Live, bus: Bus, vehicle: str, clock: Clock) -> None:
+    def __init__(self, live: Devices, bus: Bus, vehicle: str, clock: Clock) -> None:
         self._live, self._bus, self._vehicle, self._clock = live, bus, vehicle, clock
         self._ended = threading.Event()
         self._beat = threading.Thread(target=self._beat_on, name="beat", daemon=True)

@@ -18,15 +18,24 @@ from air.timing import Timebase
 from common.errors import ConfigError, SourceError
 from common.measurements import CameraFrame, Measurement, RawBytes
 
+BASE = "base"
+
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """What one arrival at the host, at the true time `t_s`, tells: bytes of `device`, and the measurements in them."""
+    """What one arrival at the host, at the true time `t_s`, tells.
+
+    `device` sent `size` bytes, which completed so many `frames`; `dropped` bytes were none. `found` are the
+    measurements in them, `measurements` all that follows: those of known time, the raw bytes, and the clocks' states.
+    """
 
     t_s: float
     device: str
     size: int
-    measurements: list[Measurement]
+    frames: int
+    dropped: int
+    found: Sequence[Measurement]
+    measurements: Sequence[Measurement]
 
 
 class SimulatedFlight:
@@ -77,9 +86,7 @@ class SimulatedFlight:
         """The flight, arrival by arrival."""
         self._drivers = self.aircraft.drivers()
         host = _Host(self._drivers, Timebase(self.known.delays_s), self.aircraft)
-        for arrival in self.aircraft.arrivals():
-            size = 0 if isinstance(arrival.data, CameraFrame) else len(arrival.data)
-            yield Heard(arrival.t_s, arrival.device, size, list(host.take(arrival)))
+        return map(host.take, self.aircraft.arrivals())
 
 
 class _Host:
@@ -90,24 +97,27 @@ class _Host:
         self._aircraft = aircraft
         self._switched_on_ns = aircraft.start_ns - aircraft.host_ns(0.0)
 
-    def take(self, arrival: Arrival) -> Iterator[Measurement]:
+    def take(self, arrival: Arrival) -> Heard:
         """What an arrival tells."""
-        host_ns, device = self._aircraft.host_ns(arrival.t_s), arrival.device
-        found: list[Measurement]
-        if isinstance(arrival.data, CameraFrame):
-            found, scale = [arrival.data], TimeScale.DEVICE
-        else:
-            yield RawBytes(self._time_of_day_ns(host_ns), device, arrival.data)
-            driver = self._drivers[device]
-            found, scale = driver.feed(arrival.data, host_ns), driver.scale
-        for measurement in found:
-            if device == "base":  # far away: it tells nothing about the clocks on board
-                yield measurement
-                continue
-            stamped = self._timebase.restamp(measurement, device, scale, host_ns)
-            if stamped is not None:
-                yield stamped
-        yield from self._timebase.states(host_ns)
+        host_ns, device, data = self._aircraft.host_ns(arrival.t_s), arrival.device, arrival.data
+        if isinstance(data, CameraFrame):
+            told = self._stamped([data], device, TimeScale.DEVICE, host_ns)
+            return Heard(arrival.t_s, device, len(data.data), 1, 0, [data], told)
+        raw = RawBytes(self._time_of_day_ns(host_ns), device, data)
+        driver = self._drivers[device]
+        counts = driver.counts
+        frames, dropped = counts.frames.total(), counts.dropped_bytes
+        found = driver.feed(data, host_ns)
+        told = [raw, *self._stamped(found, device, driver.scale, host_ns)]
+        frames, dropped = counts.frames.total() - frames, counts.dropped_bytes - dropped
+        return Heard(arrival.t_s, device, len(data), frames, dropped, found, told)
+
+    def _stamped(self, found: Sequence[Measurement], device: str, scale: TimeScale, host_ns: int) -> list[Measurement]:
+        """Those of known time, and once a second the states of the clocks."""
+        if device == BASE:  # far away: it tells nothing about the clocks on board
+            return list(found)
+        stamped = [self._timebase.restamp(measurement, device, scale, host_ns) for measurement in found]
+        return [*(known for known in stamped if known is not None), *self._timebase.states(host_ns)]
 
     def _time_of_day_ns(self, host_ns: int) -> int:
         """GNSS time; as long as it is unknown, that of the computer's clock, which was set at the start."""
