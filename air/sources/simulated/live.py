@@ -34,8 +34,9 @@ class LiveFlight:
         self._closed.set()
 
     def __iter__(self) -> Iterator[Measurement]:
-        begun_s = self._now_s()
+        begun_s: float | None = None
         for heard in self._flight.heard():
+            begun_s = self._now_s() - heard.t_s if begun_s is None else begun_s
             behind_s = self._now_s() - begun_s - heard.t_s
             if self._closed.wait(max(0.0, -behind_s)):
                 return
