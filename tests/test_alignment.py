@@ -106,3 +106,18 @@ def test_without_any_position_nothing_is_placed(survey):
     assert not alignment.finish()
     assert alignment.datum is None
     assert all("no GPS" in s.reason for s in alignment.statuses())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("growth", [1.3, 2.0])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_the_focal_length_is_found_however_seldom_all_photos_are_adjusted(seed, growth):
+    """Between adjustments of all photos the block is held together by local ones, with a focal length 3 % wrong."""
+    source = open_photos(f"sim:survey?seed={seed}&photos=24")
+    alignment = Alignment("test", replace(SETTINGS, growth=growth))
+    for photo in source:
+        alignment.add(prepare(photo, SETTINGS))
+    final = alignment.finish()
+    assert len(final) == 24
+    assert alignment.cameras[0].fx == pytest.approx(source.truth.camera.fx, rel=0.01)
+    assert rmse(final, source.truth, alignment.datum, list(range(24))) < 0.05
