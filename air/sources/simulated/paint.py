@@ -9,8 +9,8 @@ from air.sources.simulated.layout import Box, Layout, Road
 from air.sources.simulated.noise import fractal, smoothstep
 from common.arrays import F64, I32, U8
 
-COARSE_CELLS = 4
-"""Meadow and soil vary slowly: they are painted on a coarser grid and enlarged."""
+COARSE_CELL = 0.2
+"""Meadow and soil vary slowly: they are painted on a coarser grid, m, and enlarged."""
 _SHIFT = 4
 
 # RGB (gamma 2) and strength of the fine detail, 255 = 100 %.
@@ -28,7 +28,7 @@ PAVING = (158, 148, 136, 24)
 
 def paint_ground(rng: np.random.Generator, layout: Layout, cell: float) -> U8:
     """Colour and detail strength (H, W, 4) uint8 of the ground on a grid of `cell` m over the layout's bounds."""
-    canvas = _Canvas(layout, cell, _meadow(rng, layout, cell))
+    canvas = Canvas(layout, cell, meadow(rng, layout, cell))
     canvas.scatter_stones(rng)
     for yard in layout.yards:
         canvas.pave(rng, yard)
@@ -44,9 +44,11 @@ def paint_ground(rng: np.random.Generator, layout: Layout, cell: float) -> U8:
     return canvas.image
 
 
-def _meadow(rng: np.random.Generator, layout: Layout, cell: float) -> U8:
+def meadow(rng: np.random.Generator, layout: Layout, cell: float) -> U8:
+    """Colour and detail strength (H, W, 4) uint8 of grass, lush and dry, and of bare soil, over a layout's bounds."""
     rows, columns = layout.bounds.grid(cell)
-    coarse_shape, coarse_cell = (rows // COARSE_CELLS + 2, columns // COARSE_CELLS + 2), cell * COARSE_CELLS
+    cells = max(1, round(COARSE_CELL / cell))
+    coarse_shape, coarse_cell = (rows // cells + 2, columns // cells + 2), cell * cells
 
     def mask(low: float, high: float, *octaves: tuple[float, float]) -> np.typing.NDArray[np.float32]:
         return smoothstep(low, high, fractal(rng, coarse_shape, coarse_cell, octaves))[..., None]
@@ -60,22 +62,24 @@ def _meadow(rng: np.random.Generator, layout: Layout, cell: float) -> U8:
         image += (colour - image) * weight
     image[..., :3] *= 1 + fractal(rng, coarse_shape, coarse_cell, ((8, 0.05), (2, 0.06), (0.8, 0.06)))[..., None]
     small = np.clip(image, 0, 255).astype(np.uint8)
-    enlarge = np.array([[1 / COARSE_CELLS, 0, 0], [0, 1 / COARSE_CELLS, 0]])
+    enlarge = np.array([[1 / cells, 0, 0], [0, 1 / cells, 0]])
     return np.asarray(
         cv2.warpAffine(small, enlarge, (columns, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP), np.uint8
     )
 
 
-class _Canvas:
+class Canvas:
     """Draws in world coordinates on the grid of colours."""
 
     def __init__(self, layout: Layout, cell: float, image: U8):
         self.layout, self.cell, self.image = layout, cell, np.ascontiguousarray(image)
 
     def pixels(self, xy: F64) -> I32:
+        """Points (N, 2) m in world as OpenCV's fixed-point pixels."""
         return np.asarray(np.round(self.layout.bounds.pixels(xy, self.cell) * 2**_SHIFT), np.int32)
 
     def polygon(self, xy: F64, colour: tuple[int, ...]) -> None:
+        """Fill a polygon (N, 2) m in world."""
         cv2.fillPoly(self.image, [self.pixels(xy)], colour, cv2.LINE_AA, _SHIFT)
 
     def line(self, xy: F64, width: float, colour: tuple[int, ...]) -> None:

@@ -44,7 +44,7 @@ def compiled(function: F) -> F:
     Compiled functions allocate nothing, so they need no run time (`_nrt`), whose counting of references to the
     arrays of a scene would double the time of a ray; inlined, they do not hand the scene around on the stack.
     """
-    return cast(F, njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)(function))
+    return cast(F, njit(cache=True, error_model="numpy", _nrt=False, forceinline=True, nogil=True)(function))
 
 
 @compiled
@@ -99,7 +99,7 @@ def top_at(scene: Scene, x: float, y: float) -> tuple[float, int]:
 
 
 @compiled
-def _enter_house(
+def enter_house(
     solids: Solids, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, int]:
     """Where a ray enters a house: parameter (inf: it misses) and face, by clipping with its six half-spaces."""
@@ -191,7 +191,7 @@ def first_solid(
                 for n in range(first[c], first[c + 1]):
                     k = listed[n]
                     if solids[k].kind == HOUSE:
-                        t_hit, f = _enter_house(solids, k, ox, oy, oz, dx, dy, dz)
+                        t_hit, f = enter_house(solids, k, ox, oy, oz, dx, dy, dz)
                     else:
                         t_hit, f = _enter_dome(solids, k, ox, oy, oz, dx, dy, dz)
                     if t0 <= t_hit < best:

@@ -17,8 +17,8 @@ HOUSE, DOME = 0, 1
 """A house is a box under a gable (slope 0: a flat roof); a dome is half an ellipsoid on a cylinder."""
 EAST_WALL, WEST_WALL, NORTH_WALL, SOUTH_WALL, NORTH_ROOF, SOUTH_ROOF, DOME_TOP, DOME_SIDE, GROUND = range(9)
 """Faces; a house's own east is along its `a`, its own north along its `b`."""
-PLAIN, TILES, RIBS, PLASTER = range(4)
-"""Patterns on the surface of a house; domes have leaves."""
+PLAIN, TILES, RIBS, PLASTER, FACADE, CONCRETE = range(6)
+"""Patterns on the surface of a house; domes have leaves. The photo survey knows the first four."""
 
 
 SOLID = np.dtype(

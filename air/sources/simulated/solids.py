@@ -24,7 +24,7 @@ CROWNS = [(74, 98, 46), (62, 86, 44), (88, 108, 52), (98, 102, 56), (54, 78, 46)
 
 
 @dataclass(frozen=True)
-class _Solid:
+class Solid:
     """One solid before it becomes a row of `Solids`; colours are RGB with gamma 2."""
 
     kind: int
@@ -42,18 +42,22 @@ class _Solid:
     seed: int
 
 
+def box_solid(box: Box, ground: float, roof: Colour, wall: Colour, patterns: tuple[int, int], seed: int) -> Solid:
+    """The solid of a box that stands on ground of a height m; patterns of its roof and its walls."""
+    top = ground + box.wall_height + box.slope * box.b
+    return Solid(HOUSE, box.x, box.y, box.heading, box.a, box.b, top, box.slope, roof, wall, *patterns, seed)
+
+
 def build_solids(rng: np.random.Generator, layout: Layout, ground: Ground) -> Solids:
     """All solids of a layout on the `ground` (height m at x, y)."""
 
     def pick(colours: list[Colour]) -> Colour:
         return colours[int(rng.integers(len(colours)))]
 
-    solids: list[_Solid] = []
+    solids: list[Solid] = []
 
     def box(b: Box, roof: Colour, wall: Colour, roof_pattern: int, wall_pattern: int) -> None:
-        top = ground(b.x, b.y) + b.wall_height + b.slope * b.b
-        kind = (HOUSE, b.x, b.y, b.heading, b.a, b.b, top, b.slope)
-        solids.append(_Solid(*kind, roof, wall, roof_pattern, wall_pattern, len(solids)))
+        solids.append(box_solid(b, ground(b.x, b.y), roof, wall, (roof_pattern, wall_pattern), len(solids)))
 
     for house in layout.houses:
         flat = house.body.slope == 0.0
@@ -70,15 +74,15 @@ def build_solids(rng: np.random.Generator, layout: Layout, ground: Ground) -> So
         box(car.cabin, colour, GLASS, PLAIN, PLAIN)
     for tree in layout.trees:
         solids.extend(_crown(rng, tree, ground(tree.x, tree.y), pick(CROWNS), len(solids)))
-    return _table(solids)
+    return solid_table(solids)
 
 
-def _crown(rng: np.random.Generator, tree: Tree, ground: float, colour: Colour, seed: int) -> list[_Solid]:
+def _crown(rng: np.random.Generator, tree: Tree, ground: float, colour: Colour, seed: int) -> list[Solid]:
     """A crown: one dome and smaller ones that stick out of it, lighter or darker."""
 
-    def dome(x: float, y: float, r: float, vertical: float, top: float) -> _Solid:
+    def dome(x: float, y: float, r: float, vertical: float, top: float) -> Solid:
         shade = tuple(float(np.clip(c * rng.normal(1.0, 0.07), 10, 250)) for c in colour)
-        return _Solid(DOME, x, y, 0.0, r, vertical, top, 0.0, shade, shade, PLAIN, PLAIN, seed)
+        return Solid(DOME, x, y, 0.0, r, vertical, top, 0.0, shade, shade, PLAIN, PLAIN, seed)
 
     top, vertical = ground + tree.height, min(1.6 * tree.radius, 0.85 * tree.height)
     crown = [dome(tree.x, tree.y, 0.9 * tree.radius, vertical, top)]
@@ -91,7 +95,8 @@ def _crown(rng: np.random.Generator, tree: Tree, ground: float, colour: Colour, 
     return crown
 
 
-def _table(solids: list[_Solid]) -> Solids:
+def solid_table(solids: list[Solid]) -> Solids:
+    """Records of solids."""
     table = np.zeros(len(solids), SOLID)
     for name in ("kind", "x", "y", "a", "b", "top", "slope", "roof_pattern", "wall_pattern", "seed"):
         table[name] = [getattr(solid, name) for solid in solids]
@@ -101,14 +106,18 @@ def _table(solids: list[_Solid]) -> Solids:
     return table
 
 
-def index_solids(solids: Solids, bounds: Bounds, cell: float) -> tuple[I32, I32, F64]:
-    """Which solids each cell of a grid may hold: `first` (C + 1,), `listed`, `cell_top` (C,) as `Scene` says."""
+def index_solids(solids: Solids, bounds: Bounds, cell: float, margin: float = 0.0) -> tuple[I32, I32, F64]:
+    """Which solids each cell of a grid may hold: `first` (C + 1,), `listed`, `cell_top` (C,) as `Scene` says.
+
+    A cell also lists the solids that are up to `margin` m away from it.
+    """
     rows, columns = bounds.grid(cell)
     members: list[list[int]] = [[] for _ in range(rows * columns)]
     tops = np.full(rows * columns, -np.inf)
     house = solids["kind"] == HOUSE
     reach_x = np.where(house, np.abs(solids["cos"]) * solids["a"] + np.abs(solids["sin"]) * solids["b"], solids["a"])
     reach_y = np.where(house, np.abs(solids["sin"]) * solids["a"] + np.abs(solids["cos"]) * solids["b"], solids["a"])
+    reach_x, reach_y = reach_x + margin, reach_y + margin
     j0, j1 = (np.floor((solids["x"] + sign * reach_x - bounds.west) / cell).astype(int) for sign in (-1, 1))
     i0, i1 = (np.floor((solids["y"] + sign * reach_y - bounds.south) / cell).astype(int) for sign in (-1, 1))
     for k in range(len(solids)):
