@@ -62,6 +62,10 @@ class Mode(StrEnum):
     """How the aircraft's pose is known at the moment."""
 
     INITIALIZING = "initializing"
+    GNSS_VISUAL_INERTIAL = "gnss-visual-inertial"
+    VISUAL_INERTIAL = "visual-inertial"
+    GNSS_INERTIAL = "gnss-inertial"
+    INERTIAL = "inertial"
     PHOTOGRAMMETRIC = "photogrammetric"
 
 
@@ -94,6 +98,28 @@ class Keyframe:
     camera: CameraModel
     sigma: F64
     thumbnail: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorState:
+    """What the odometry believes besides the pose.
+
+    `accel_bias` (3,) m/s² and `gyro_bias` (3,) rad/s; `T_body_cam` and `time_offset_s` (IMU time minus frame time) as
+    calibrated or estimated; how many `points` and `satellites` are in use, and the root mean square of the reprojection
+    errors.
+    """
+
+    flight: str
+    t_ns: int
+    revision: int
+    mode: Mode
+    accel_bias: F64
+    gyro_bias: F64
+    T_body_cam: SE3
+    time_offset_s: float
+    points: int
+    satellites: int
+    reprojection_rms_px: float
 
 
 @dataclass(frozen=True, order=True)
@@ -162,4 +188,4 @@ class Health:
     counts: dict[str, int] = field(default_factory=dict)
 
 
-Message = Datum | Pose | Keyframe | MapTile | MapDigest | TileRequest | Health | Measurement
+Message = Datum | Pose | Keyframe | EstimatorState | MapTile | MapDigest | TileRequest | Health | Measurement

@@ -17,7 +17,7 @@ from common.measurements import (
     ReceiverSolution,
     VehicleState,
 )
-from common.messages import Datum, Health, Keyframe, MapDigest, MapTile, Message, Pose, TileRequest
+from common.messages import Datum, EstimatorState, Health, Keyframe, MapDigest, MapTile, Message, Pose, TileRequest
 
 
 class Priority(Enum):
@@ -70,6 +70,7 @@ DATUM = Stream("datum", Datum, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.B
 HEALTH = Stream("health", Health, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 5.0, keyed=True)
 DIGEST = Stream("map/digest", MapDigest, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 256_000, 5.0)
 KEYFRAME = Stream("keyframe", Keyframe, 0.0, Priority.DATA, Congestion.BLOCK, Radio.VIDEO, 64_000, 0.0, keyed=True)
+ESTIMATOR = Stream("estimator", EstimatorState, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 1_000, 5.0)
 TILE = Stream("map/tile", MapTile, 0.0, Priority.DATA_LOW, Congestion.BLOCK, Radio.VIDEO, 256_000, 0.0, keyed=True)
 TILE_REQUEST = Stream("cmd/tiles", TileRequest, 0.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 64_000, 0.0)
 
@@ -98,7 +99,7 @@ _PICTURES = (Priority.BACKGROUND, Congestion.BLOCK, Radio.LOCAL)
 RAW_CAMERA = Stream("raw/camera", CameraFrame, 30.0, *_PICTURES, 8_000_000, 1.0, keyed=True)
 
 STREAMS: tuple[Stream, ...] = (
-    *(POSE, DATUM, HEALTH, DIGEST, KEYFRAME, TILE, TILE_REQUEST),
+    *(POSE, DATUM, HEALTH, DIGEST, KEYFRAME, ESTIMATOR, TILE, TILE_REQUEST),
     *(VEHICLE, CLOCK, RTCM),
     *(RAW_IMU, RAW_GNSS, RAW_EPHEMERIS, RAW_GLONASS, RAW_IONOSPHERE, RAW_SOLUTION, RAW_BYTES, RAW_CAMERA),
 )

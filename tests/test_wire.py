@@ -248,8 +248,8 @@ def changed(sample: Message, **changes: Any) -> bytes:
     return bytes(msgpack.packb({name: value for name, value in raw.items() if value is not ...}))
 
 
-DATUM, POSE, KEYFRAME, TILE_SAMPLE, DIGEST, REQUEST, HEALTH = SAMPLES[:7]
-RAW, IMU, FRAME, EPOCH, KEPLER, GLONASS, IONOSPHERE, SOLUTION, CLOCK, VEHICLE = SAMPLES[7:]
+DATUM, POSE, KEYFRAME, ESTIMATOR, TILE_SAMPLE, DIGEST, REQUEST, HEALTH = SAMPLES[:8]
+RAW, IMU, FRAME, EPOCH, KEPLER, GLONASS, IONOSPHERE, SOLUTION, CLOCK, VEHICLE = SAMPLES[8:]
 PNG_8 = bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1])
 PNG_9 = bytes(cv2.imencode(".png", np.zeros((9, 9), np.uint8))[1])
 BOMB = bytes(cv2.imencode(".png", np.zeros((8000, 8000), np.uint8))[1])

@@ -32,6 +32,7 @@ from common.measurements import (
 )
 from common.messages import (
     Datum,
+    EstimatorState,
     Health,
     Keyframe,
     Level,
@@ -99,6 +100,10 @@ SAMPLES: tuple[Message, ...] = (
         CameraModel(1600, 1200, 1125.5, 1125.5, 799.5, 599.5, -0.01, 0.002),
         np.array([0.5, 0.5, 0.75]),
         jpeg(8, 6),
+    ),
+    EstimatorState(
+        *(FLIGHT, 1_400_000_001_000_000_000, 1, Mode.VISUAL_INERTIAL, np.array([0.03, -0.01, 0.02]), np.zeros(3)),
+        *(SE3.from_quaternion([0.0, 1.0, 0.0, 0.0], [0.1, 0.0, -0.08]), -0.004, 150, 0, 0.62),
     ),
     smooth_tile(8),
     MapDigest(FLIGHT, 1_400_000_002_000_000_000, np.array([[0, -1, 2, 5], [0, 0, 0, 1]], np.int32)),
@@ -288,6 +293,11 @@ STRATEGIES: dict[type[Any], st.SearchStrategy[Any]] = {
     Datum: st.builds(Datum, _flight, _floats(90.0), _floats(180.0), _floats(1e4)),
     Pose: st.builds(
         Pose, _flight, _t_ns, _count, _se3, st.none() | _vectors(1e3), _vectors(1e6, 0.0), st.sampled_from(Mode)
+    ),
+    EstimatorState: st.builds(
+        EstimatorState,
+        *(_flight, _t_ns, _count, st.sampled_from(Mode), _vectors(1e3), _vectors(1e3)),
+        *(_se3, _floats(10.0), _count, _count, st.floats(0.0, 1e3)),
     ),
     Keyframe: st.builds(
         Keyframe,

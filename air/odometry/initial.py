@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from air.odometry.initial_prior import Sigmas
 from air.odometry.preintegration import InertialState
 from air.odometry.tracker import TrackedFrame
-from air.odometry.window import Sigmas
 from common.arrays import F64
 
 

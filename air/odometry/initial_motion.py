@@ -19,10 +19,10 @@ import gtsam
 import numpy as np
 
 from air.odometry.initial import Initial, Refusal, common_rays, level
+from air.odometry.initial_prior import Sigmas
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator
 from air.odometry.settings import ImuSettings, InitializationSettings
 from air.odometry.tracker import TrackedFrame
-from air.odometry.window import Sigmas
 from common.arrays import F64, I64
 from common.se3 import SE3
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from air.odometry.initial import Initial, Refusal, common_rays, level
+from air.odometry.initial_prior import Sigmas
 from air.odometry.preintegration import InertialState
 from air.odometry.settings import ImuSettings, InitializationSettings
 from air.odometry.tracker import TrackedFrame
-from air.odometry.window import Sigmas
 from common.measurements import ImuSample
 from common.se3 import SE3
 

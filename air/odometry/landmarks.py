@@ -55,6 +55,18 @@ def outliers(views: Sequence[View], points: Mapping[int, F64], focal: float, lim
     return [(int(seen.view[i]), ids[seen.row[i]]) for i in np.flatnonzero(~(error <= limit_px)).tolist()]
 
 
+def rms_px(views: Sequence[View], points: Mapping[int, F64], focal: float) -> float:
+    """Root mean square distance px between where points should appear and were seen; 0 without any."""
+    square, count = 0.0, 0
+    for view in views:
+        ids = [i for i in view.xy if i in points]
+        if ids:
+            p = view.T_world_cam.inverse().apply(np.array([points[i] for i in ids]))
+            miss = focal * p[:, :2] / p[:, 2:] - np.array([view.xy[i] for i in ids])
+            square, count = square + float(np.sum(miss**2)), count + len(ids)
+    return float(np.sqrt(square / count)) if count else 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """M observations: index of the view, row of the id, ideal image point px."""

@@ -79,6 +79,11 @@ class ImuBuffer:
         self._samples.append(sample)
         return True
 
+    @property
+    def last_ns(self) -> int | None:
+        """Time of the last sample."""
+        return self._t[-1] if self._t else None
+
     def covers(self, begin_ns: int, end_ns: int) -> bool:
         """Whether samples lie on both sides of a stretch of time."""
         return bool(self._t) and self._t[0] <= begin_ns and end_ns <= self._t[-1]
@@ -154,6 +159,24 @@ class Preintegrator:
         nav = measurement.predict(gtsam.NavState(to_pose3(state.T_world_body), state.v_world), state.bias)
         t_ns = state.t_ns + round(float(pieces.dt_s.sum()) * 1e9)
         return InertialState(t_ns, from_pose3(nav.pose()), nav.velocity(), state.accel_bias, state.gyro_bias)
+
+
+class Propagation:
+    """A state carried on by the IMU, piece by piece."""
+
+    def __init__(self, integrator: Preintegrator, state: InertialState) -> None:
+        self.state = state
+        self._first = state
+        self._start = gtsam.NavState(to_pose3(state.T_world_body), state.v_world)
+        self._measurement = gtsam.PreintegratedCombinedMeasurements(integrator.parameters(), state.bias)
+
+    def advance(self, pieces: ImuPieces) -> None:
+        """Carry the state on over pieces that begin where it stands."""
+        for accel, gyro, dt in zip(pieces.accel, pieces.gyro, pieces.dt_s.tolist(), strict=True):
+            self._measurement.integrateMeasurement(accel, gyro, dt)
+        nav, first = self._measurement.predict(self._start, self._first.bias), self._first
+        t_ns = self.state.t_ns + round(float(pieces.dt_s.sum()) * 1e9)
+        self.state = InertialState(t_ns, from_pose3(nav.pose()), nav.velocity(), first.accel_bias, first.gyro_bias)
 
 
 def to_pose3(T: SE3) -> gtsam.Pose3:

@@ -76,7 +76,8 @@ class InitializationSettings:
 
     At rest: after `still_s` in which accelerations and rates have standard deviations below `still_accel` m/s² and
     `still_gyro` rad/s, and the image moves by less than `still_px`. In motion: from `frames` of the last `span_s` at
-    most, between which points moved by `parallax_deg`, when the adjustment knows the scale within `scale_sigma`.
+    most, between which points moved by `parallax_deg`, when the adjustment knows the scale within `scale_sigma`; tried
+    every `try_every_s`.
     """
 
     still_s: Annotated[float, Range(0.2, 60.0)] = 1.0
@@ -86,14 +87,37 @@ class InitializationSettings:
     frames: Annotated[int, Range(5, 40)] = 10
     span_s: Annotated[float, Range(0.5, 20.0)] = 3.0
     parallax_deg: Annotated[float, Range(0.1, 45.0)] = 3.0
-    scale_sigma: Annotated[float, Range(0.001, 1.0)] = 0.1
+    scale_sigma: Annotated[float, Range(0.001, 1.0)] = 0.15
+    try_every_s: Annotated[float, Range(0.0, 10.0)] = 0.3
+
+
+@dataclass(frozen=True)
+class DegradationSettings:
+    """When a part of the estimate counts as lost and as back, and what cannot be true.
+
+    The camera is lost after `lost_s` with fewer than `few_points`, and back after `back_s` with `enough_points`; GNSS
+    likewise. A jump of the velocity against the IMU by `velocity_jump` m/s from one frame to the next, and biases of
+    more than `bias_sigmas`, are impossible.
+    """
+
+    few_points: Annotated[int, Range(0, 1000)] = 8
+    enough_points: Annotated[int, Range(1, 1000)] = 15
+    few_satellites: Annotated[int, Range(0, 100)] = 4
+    enough_satellites: Annotated[int, Range(1, 100)] = 6
+    lost_s: Annotated[float, Range(0.0, 60.0)] = 1.0
+    back_s: Annotated[float, Range(0.0, 60.0)] = 0.5
+    velocity_jump: Annotated[float, Range(0.1, 100.0)] = 2.0
+    bias_sigmas: Annotated[float, Range(1.0, 100.0)] = 6.0
 
 
 @dataclass(frozen=True)
 class OdometrySettings:
-    """Settings of the odometry."""
+    """Settings of the odometry. `rate_hz` is how often at most the window is solved; every frame is tracked."""
+
+    rate_hz: Annotated[float, Range(1.0, 100.0)] = 10.0
 
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     imu: ImuSettings = field(default_factory=ImuSettings)
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
+    degradation: DegradationSettings = field(default_factory=DegradationSettings)

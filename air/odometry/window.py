@@ -15,7 +15,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
-from air.odometry.landmarks import View, locate, outliers
+from air.odometry.initial_prior import Sigmas, initial_prior
+from air.odometry.landmarks import View, locate, outliers, rms_px
 from air.odometry.marginalization import marginalize
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
 from air.odometry.settings import ImuSettings, WindowSettings
@@ -27,22 +28,10 @@ HUBER = 1.345
 TOLERANCE = 1e-4
 WEAK = 100.0
 """Sigma of the prior of a point, in distances of the point."""
-TRIALS = 5
+TRIALS, SETTLING = 5, 6
 """How many undetermined points are removed before a solution is given up."""
 STILL_SPEED, STILL_TURN, STILL_SHIFT = 0.02, 0.002, 0.005
 """How far the aircraft moves while it stands, m/s, rad and m."""
-
-
-@dataclass(frozen=True)
-class Sigmas:
-    """How well the first state is known: tilt and yaw rad, position m, velocity m/s, biases m/s² and rad/s."""
-
-    tilt: float
-    yaw: float
-    position: float
-    velocity: float
-    accel_bias: float
-    gyro_bias: float
 
 
 @dataclass(eq=False)
@@ -121,6 +110,15 @@ class Window:
         """Points (3,) m in world by id."""
         return {i: self.values.atPoint3(L(i)) for i in sorted(self.points)}
 
+    def depths(self, state: InertialState) -> dict[int, float]:
+        """Distance m along the camera's axis of the points, by id, seen from a state; those before the camera."""
+        ids = sorted(self.points)
+        if not ids:
+            return {}
+        T_world_cam = state.T_world_body @ self._T_body_cam
+        z = T_world_cam.inverse().apply(np.array([self.values.atPoint3(L(i)) for i in ids]))[:, 2]
+        return {i: float(d) for i, d in zip(ids, z, strict=True) if d > 0}
+
     # Frames
 
     def begin(self, state: InertialState, sigmas: Sigmas, xy: dict[int, F64]) -> None:
@@ -129,20 +127,8 @@ class Window:
         self.values, self.frames, self.points, self._anchored = gtsam.Values(), [], set(), set()
         self._insert(k, state)
         self.frames.append(Frame(k, state.t_ns, xy))
-        s, imu = sigmas, self._imu_settings
-        # gtsam's tangent turns about body axes: tilt and yaw are seen from there.
-        axes = state.T_world_body.R.T
-        turn = axes @ np.diag([s.tilt**2, s.tilt**2, s.yaw**2]) @ axes.T
-        covariance = np.block([[turn, np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3) * s.position**2]])
-        bias = noise.Diagonal.Sigmas(np.repeat([s.accel_bias, s.gyro_bias], 3))
-        prior = gtsam.NonlinearFactorGraph()
-        prior.add(gtsam.PriorFactorPose3(X(k), to_pose3(state.T_world_body), noise.Gaussian.Covariance(covariance)))
-        prior.add(gtsam.PriorFactorVector(V(k), state.v_world, noise.Isotropic.Sigma(3, s.velocity)))
-        prior.add(gtsam.PriorFactorConstantBias(B(k), state.bias, bias))
-        # Nothing is known of biases beyond what the device's maker says.
-        weak = noise.Diagonal.Sigmas(np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3))
-        prior.add(gtsam.PriorFactorConstantBias(B(k), gtsam.imuBias.ConstantBias(), weak))
-        self._prior, self._covariance = prior, covariance
+        self._sigmas = sigmas
+        self._prior, self._covariance = initial_prior(k, state, sigmas, self._imu_settings)
 
     def predict(self, t_ns: int) -> InertialState:
         """Where the newest state leads to by the IMU."""
@@ -218,6 +204,25 @@ class Window:
         self._reintegrate()
         rms = self._prune()
         return Solution(rms, len(self.points), iterations)
+
+    def settle(self) -> Solution:
+        """Solve until nothing changes any more: what has only begun is far from its solution."""
+        solution = self.solve()
+        for _ in range(SETTLING):
+            before, solution = solution, self.solve()
+            if solution.failed or (solution.points == before.points and solution.iterations == 1):
+                break
+        return solution
+
+    def move(self, T_new_world: SE3) -> None:
+        """Turn everything about the vertical and shift it; nothing has been marginalized so far."""
+        pose, R = to_pose3(T_new_world), T_new_world.R
+        for frame in self.frames:
+            self.values.update(X(frame.k), pose.compose(self.values.atPose3(X(frame.k))))
+            self.values.update(V(frame.k), R @ self.values.atVector(V(frame.k)))
+        for i, p_world in self.positions().items():
+            self.values.update(L(i), T_new_world.apply(p_world))
+        self._prior, _ = initial_prior(self.frames[0].k, self.state(0), self._sigmas, self._imu_settings)
 
     def _remove_named(self, error: str) -> bool:
         named = re.search(r"Symbol: l(\d+)", error)
@@ -369,15 +374,3 @@ class Window:
         rivals = sorted((oldest.factors.keys() & self.points) - ended - already)
         rivals.sort(key=lambda i: -sum(i in frame.factors for frame in self.frames))
         return already | set(rivals[: max(0, self._settings.anchored - len(already))])
-
-
-def rms_px(views: list[View], points: dict[int, F64], focal: float) -> float:
-    """Root mean square distance px between where points should appear and were seen; 0 without any."""
-    square, count = 0.0, 0
-    for view in views:
-        ids = [i for i in view.xy if i in points]
-        if ids:
-            p = view.T_world_cam.inverse().apply(np.array([points[i] for i in ids]))
-            miss = focal * p[:, :2] / p[:, 2:] - np.array([view.xy[i] for i in ids])
-            square, count = square + float(np.sum(miss**2)), count + len(ids)
-    return float(np.sqrt(square / count)) if count else 0.0

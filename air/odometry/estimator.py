@@ -1,0 +1,234 @@
+"""The visual–inertial estimator: IMU samples and tracked frames in, states out.
+
+It begins, adjusts its window at each frame, watches itself, and starts its window anew where it has gone astray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from air.odometry.degradation import Monitor
+from air.odometry.initial import Refusal
+from air.odometry.initial_prior import Sigmas
+from air.odometry.initial_rest import moving
+from air.odometry.initialization import Initialization
+from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, Propagation
+from air.odometry.row_times import ideal_points
+from air.odometry.settings import OdometrySettings
+from air.odometry.tracker import TrackedFrame
+from air.odometry.window import Solution, Window
+from common.arrays import F64
+from common.measurements import ImuSample
+from common.messages import Mode
+from common.se3 import SE3
+
+AGAIN = Sigmas(tilt=0.02, yaw=0.02, position=0.5, velocity=0.5, accel_bias=0.05, gyro_bias=0.005)
+"""How well the IMU's prediction is known where the window starts anew."""
+HALF_GYRO_NS = 10_000_000
+RETRY_S = 5.0
+MIN_STILL_S = 0.09
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The state at a frame; covariance (6, 6) of its pose: rotation rad and position m in body axes.
+
+    `keyframe` is the state at the frame before when that has become a keyframe. A higher `revision` says that the
+    world frame has jumped. `note` tells what happened, if anything did.
+    """
+
+    state: InertialState
+    covariance: F64
+    mode: Mode
+    revision: int
+    solution: Solution
+    keyframe: InertialState | None = None
+    note: str = ""
+
+
+class Estimator:
+    """Visual–inertial odometry of tracked frames. Feed it samples and frames in order of time."""
+
+    def __init__(self, focal: float, T_body_cam: SE3, settings: OdometrySettings | None = None) -> None:
+        self._settings = settings or OdometrySettings()
+        self._focal, self._T_body_cam = focal, T_body_cam
+        self.buffer = ImuBuffer(self._settings.imu)
+        self._integrator = Preintegrator(self._settings.imu)
+        self._window: Window | None = None
+        self._initialization = self._new_initialization()
+        self._monitor = Monitor(self._settings.degradation)
+        self._propagation: Propagation | None = None
+        self._last: TrackedFrame | None = None
+        self._repaired_ns = -(10**18)
+        self.revision = 0
+
+    def _new_initialization(self) -> Initialization:
+        return Initialization(self._focal, self._T_body_cam, self.buffer, self._settings)
+
+    @property
+    def window(self) -> Window | None:
+        """The window; None while there is none."""
+        return self._window
+
+    def gyro_bias(self) -> F64:
+        """Bias (3,) rad/s of the gyroscope as known now."""
+        return np.zeros(3) if self._propagation is None else self._propagation.state.gyro_bias
+
+    # IMU
+
+    def add_imu(self, sample: ImuSample) -> InertialState | None:
+        """The state at a sample, by the IMU from the last frame on; None while there is none."""
+        if not self.buffer.add(sample) or self._propagation is None:
+            return None
+        pieces = self.buffer.between(self._propagation.state.t_ns, sample.t_ns)
+        self._propagation.advance(pieces)
+        return self._propagation.state
+
+    def _propagate_from(self, state: InertialState) -> None:
+        self._propagation = Propagation(self._integrator, state)
+        if (last_ns := self.buffer.last_ns) is not None:
+            self._propagation.advance(self.buffer.between(state.t_ns, last_ns))
+
+    # Frames
+
+    def add_frame(self, frame: TrackedFrame) -> Estimate | Refusal:
+        """The estimate at a frame that IMU samples cover, or why there is none."""
+        outcome = self._begin(frame) if self._window is None else self._continue(self._window, frame)
+        self._last = frame
+        return outcome
+
+    def _begin(self, frame: TrackedFrame) -> Estimate | Refusal:
+        initial = self._initialization.feed(frame)
+        if isinstance(initial, Refusal):
+            return initial
+        window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
+        first = initial.states[0]
+        window.begin(first, initial.sigmas, self._points_at(initial.frames[0], first, {}))
+        for state, seen in list(zip(initial.states, initial.frames, strict=True))[1:]:
+            window.add(seen.t_ns, self._points_at(seen, state, {}), state)
+        solution = Solution(0.0, 0, 0)
+        if len(initial.states) > 1:
+            solution = window.settle()
+            if why := self._unsure(window, solution):
+                return Refusal(why)
+        self._window, self._monitor = window, Monitor(self._settings.degradation)
+        note = "begins in motion" if len(initial.states) > 1 else "begins at rest"
+        if self._propagation is not None:  # it flew on by the IMU alone
+            self._join(window, self._propagation.state)
+        self._propagate_from(window.state())
+        return self._estimate(window, solution, note=note)
+
+    def _unsure(self, window: Window, solution: Solution) -> str:
+        """Why what began in motion is no good yet; empty when it is."""
+        s = self._settings
+        if solution.failed or solution.points < s.degradation.enough_points:
+            return f"only {solution.points} points agree"
+        if solution.rms_px > 2 * s.window.pixel_sigma:
+            return f"points miss their places by {solution.rms_px:.1f} px"
+        state = window.state()
+        travelled = state.T_world_body.R.T @ (state.T_world_body.t - window.state(0).T_world_body.t)
+        length = float(np.linalg.norm(travelled))
+        along = travelled / max(length, 1e-9)
+        sigma = float(np.sqrt(along @ window.pose_covariance[3:, 3:] @ along)) / max(length, 1e-9)
+        if not sigma < s.initialization.scale_sigma:
+            return f"the scale is known within {100 * sigma:.0f} % so far"
+        return ""
+
+    def _join(self, window: Window, before: InertialState) -> None:
+        """Place what began anew where the IMU says that the aircraft is."""
+        t_ns = window.state().t_ns
+        back = (
+            self._integrator.predict(before, self.buffer.between(before.t_ns, t_ns)) if t_ns > before.t_ns else before
+        )
+        window.move(_level_between(window.state().T_world_body, back.T_world_body))
+        self.revision += 1
+
+    def _continue(self, window: Window, frame: TrackedFrame) -> Estimate | Refusal:
+        predicted = window.predict(frame.t_ns)
+        still = self._is_still(frame)
+        window.add(frame.t_ns, self._points_at(frame, predicted, window.depths(predicted)), predicted, still)
+        solution = window.solve()
+        if why := self._astray(window, solution, predicted):
+            return self._repair(window, frame, predicted, why)
+        keyframe = window.state(-2) if window.slide() else None
+        self._propagate_from(window.state())
+        return self._estimate(window, solution, keyframe, still)
+
+    def _estimate(
+        self,
+        window: Window,
+        solution: Solution,
+        keyframe: InertialState | None = None,
+        still: bool = False,
+        note: str = "",
+    ) -> Estimate:
+        newest = window.frames[-1]
+        points = len(newest.xy) if still else len(newest.factors)
+        mode = self._monitor.update(newest.t_ns, points)
+        return Estimate(window.state(), window.pose_covariance, mode, self.revision, solution, keyframe, note)
+
+    def _points_at(self, frame: TrackedFrame, state: InertialState, depths: dict[int, float]) -> dict[int, F64]:
+        """What a frame sees, moved from the times of its rows to its own."""
+        pieces = self.buffer.between(frame.t_ns - HALF_GYRO_NS, frame.t_ns + HALF_GYRO_NS)
+        omega = np.zeros(3)
+        if len(pieces.dt_s):
+            omega = pieces.dt_s @ pieces.gyro / pieces.dt_s.sum() - state.gyro_bias
+        v_body = state.T_world_body.R.T @ state.v_world + np.cross(omega, self._T_body_cam.t)
+        R = self._T_body_cam.R.T
+        return ideal_points(frame, self._focal, R @ omega, R @ v_body, depths)
+
+    def _is_still(self, frame: TrackedFrame) -> bool:
+        last = self._last
+        if last is None or (frame.t_ns - last.t_ns) * 1e-9 < MIN_STILL_S:
+            return False
+        samples = self.buffer.samples(last.t_ns, frame.t_ns)
+        if not moving(samples, [last, frame], self._focal, self._settings.initialization):
+            turn = np.mean([s.gyro for s in samples], axis=0) - self.gyro_bias()
+            return bool(np.linalg.norm(turn) < self._settings.initialization.still_gyro)
+        return False
+
+    # When it goes wrong
+
+    def _astray(self, window: Window, solution: Solution, predicted: InertialState) -> str:
+        """Why a solution cannot be believed; empty when it can."""
+        s, state = self._settings, window.state()
+        if solution.failed or not np.isfinite(state.T_world_body.t).all():
+            return "the window has no solution"
+        jump = float(np.linalg.norm(state.v_world - predicted.v_world))
+        if jump > s.degradation.velocity_jump:
+            return f"the velocity jumps by {jump:.1f} m/s"
+        if np.linalg.norm(state.accel_bias) > s.degradation.bias_sigmas * s.imu.accel_bias_sigma:
+            return "the accelerometer's bias is impossible"
+        if np.linalg.norm(state.gyro_bias) > s.degradation.bias_sigmas * s.imu.gyro_bias_sigma:
+            return "the gyroscope's bias is impossible"
+        return ""
+
+    def _repair(self, window: Window, frame: TrackedFrame, predicted: InertialState, why: str) -> Estimate | Refusal:
+        """Start the window anew from what the IMU predicts; when that fails soon after, from nothing."""
+        self._propagate_from(predicted)
+        again = (frame.t_ns - self._repaired_ns) * 1e-9 < RETRY_S
+        self._repaired_ns = frame.t_ns
+        if again or not np.isfinite(predicted.T_world_body.t).all():
+            self._window, self._initialization = None, self._new_initialization()
+            return Refusal(f"begins anew, because {why}")
+        state = self._plausible(predicted)
+        window.begin(state, AGAIN, self._points_at(frame, state, {}))
+        self._propagate_from(state)
+        return self._estimate(window, Solution(0.0, 0, 0), note=f"window started anew: {why}")
+
+    def _plausible(self, state: InertialState) -> InertialState:
+        """The state with biases within what the device may have."""
+        s = self._settings.imu
+        accel = np.clip(state.accel_bias, -s.accel_bias_sigma, s.accel_bias_sigma)
+        gyro = np.clip(state.gyro_bias, -2 * s.gyro_bias_sigma, 2 * s.gyro_bias_sigma)
+        return replace(state, accel_bias=accel, gyro_bias=gyro)
+
+
+def _level_between(now: SE3, wanted: SE3) -> SE3:
+    """The transform, a turn about the vertical and a shift, that takes one pose as near as it can to another."""
+    turn = wanted.R @ now.R.T
+    yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    R = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    return SE3(R, wanted.t - R @ now.t)

@@ -1,0 +1,175 @@
+"""Camera frames and IMU samples in, poses and keyframes out: the odometry of one flight."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import cv2
+import numpy as np
+
+from air.alignment.prepare import thumbnail
+from air.odometry.estimator import Estimate, Estimator
+from air.odometry.initial import Refusal
+from air.odometry.preintegration import InertialState
+from air.odometry.settings import OdometrySettings
+from air.odometry.tracker import Tracker
+from air.sensors.calibration import Calibration
+from common.arrays import F64, U8
+from common.measurements import CameraFrame, Encoding, ImuSample, Measurement
+from common.messages import EstimatorState, Keyframe, Mode, Photo, Pose
+
+Output = Pose | Keyframe | EstimatorState
+WAITING = 60
+"""Frames that wait for the IMU; older ones are given up."""
+EVERY_NS = 1_000_000_000
+"""Between two `EstimatorState`."""
+
+
+class Odometry:
+    """Feed it measurements in the order in which they came; it answers with what they tell.
+
+    One camera is followed, whose calibration it is given. `world` is level; its origin and heading are those of the
+    first pose.
+    """
+
+    def __init__(self, calibration: Calibration, flight: str, settings: OdometrySettings | None = None) -> None:
+        """Raises ValueError for a calibration that does not say where the camera sits on the body."""
+        if calibration.T_body_cam is None:
+            raise ValueError("the calibration lacks T_body_cam")
+        self._settings = settings or OdometrySettings()
+        self._calibration, self._flight = calibration, flight
+        self._camera, self._T_body_cam = calibration.camera, calibration.T_body_cam
+        self.tracker = Tracker(self._camera, self._settings.tracker)
+        self.estimator = Estimator(self._camera.fx, self._T_body_cam, self._settings)
+        self._waiting: deque[tuple[int, CameraFrame]] = deque(maxlen=WAITING)
+        self._tracked_ns: int | None = None
+        self._solved_ns = self._told_ns = -(10**18)
+        self._images: deque[tuple[int, U8]] = deque(maxlen=2)
+        self._keyframes = 0
+        self._mode = Mode.INITIALIZING
+        self._sigma = np.zeros(3)
+        self.refused_frames = 0
+        self.notes: list[tuple[int, str]] = []
+        """What happened when, ns."""
+
+    def feed(self, message: Measurement | Photo) -> list[Output]:
+        """A pose for each IMU sample once it has begun; keyframes, and the estimator's state every second."""
+        if isinstance(message, CameraFrame):
+            self._waiting.append((message.t_ns + round(self._calibration.time_offset_s * 1e9), message))
+            return self._frames()
+        if isinstance(message, ImuSample):
+            state = self.estimator.add_imu(message)
+            poses: list[Output] = [] if state is None else [self._pose(state)]
+            return poses + self._frames()
+        return []
+
+    def _frames(self) -> list[Output]:
+        """What the waiting frames tell that IMU samples cover by now."""
+        out: list[Output] = []
+        last_ns = self.estimator.buffer.last_ns
+        while self._waiting and last_ns is not None and self._waiting[0][0] <= last_ns:
+            out += self._frame(*self._waiting.popleft())
+        return out
+
+    def _frame(self, t_ns: int, frame: CameraFrame) -> list[Output]:
+        image = decoded(frame)
+        if image is None or image.shape[:2] != (self._camera.height, self._camera.width):
+            self.refused_frames += 1
+            return []
+        if self._tracked_ns is not None and t_ns <= self._tracked_ns:
+            self.refused_frames += 1
+            return []
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        line_time_s = frame.line_time_s or self._calibration.line_time_s
+        tracked = self.tracker.track(np.asarray(gray, np.uint8), t_ns, self._turn(t_ns), line_time_s)
+        self._tracked_ns = t_ns
+        if t_ns - self._solved_ns < 0.9e9 / self._settings.rate_hz:
+            return []
+        self._solved_ns = t_ns
+        self._images.append((t_ns, image))
+        outcome = self.estimator.add_frame(tracked)
+        if isinstance(outcome, Refusal):
+            self._mode = Mode.INITIALIZING
+            return []
+        return self._tell(outcome)
+
+    def _turn(self, t_ns: int) -> F64:
+        """`R_last_now` (3, 3) of the camera since the last frame, by the gyroscope."""
+        if self._tracked_ns is None:
+            return np.eye(3)
+        R_body = self.estimator.buffer.between(self._tracked_ns, t_ns).turn(self.estimator.gyro_bias())
+        return self._T_body_cam.R.T @ R_body @ self._T_body_cam.R
+
+    # What is told
+
+    def _tell(self, estimate: Estimate) -> list[Output]:
+        self._mode = estimate.mode
+        R = estimate.state.T_world_body.R
+        self._sigma = np.sqrt(np.maximum(np.diag(R @ estimate.covariance[3:, 3:] @ R.T), 0.0))
+        if estimate.note:
+            self.notes.append((estimate.state.t_ns, estimate.note))
+        out: list[Output] = []
+        if estimate.keyframe is not None:
+            out.append(self._keyframe(estimate.keyframe))
+        if estimate.state.t_ns - self._told_ns >= EVERY_NS:
+            self._told_ns = estimate.state.t_ns
+            out.append(self._state(estimate))
+        return out
+
+    def _pose(self, state: InertialState) -> Pose:
+        return Pose(
+            flight=self._flight,
+            t_ns=state.t_ns,
+            revision=self.estimator.revision,
+            T_world_body=state.T_world_body,
+            v_world=state.v_world,
+            sigma=self._sigma,
+            mode=self._mode,
+        )
+
+    def _keyframe(self, state: InertialState) -> Keyframe:
+        index, self._keyframes = self._keyframes, self._keyframes + 1
+        images = [image for t_ns, image in self._images if t_ns == state.t_ns]
+        return Keyframe(
+            flight=self._flight,
+            index=index,
+            revision=self.estimator.revision,
+            t_ns=state.t_ns,
+            name=f"frame-{state.t_ns}",
+            T_world_cam=state.T_world_body @ self._T_body_cam,
+            camera=self._camera,
+            sigma=self._sigma,
+            thumbnail=thumbnail(_rgb(images[0])) if images else b"",
+        )
+
+    def _state(self, estimate: Estimate) -> EstimatorState:
+        state = estimate.state
+        return EstimatorState(
+            flight=self._flight,
+            t_ns=state.t_ns,
+            revision=estimate.revision,
+            mode=estimate.mode,
+            accel_bias=state.accel_bias,
+            gyro_bias=state.gyro_bias,
+            T_body_cam=self._T_body_cam,
+            time_offset_s=self._calibration.time_offset_s,
+            points=estimate.solution.points,
+            satellites=0,
+            reprojection_rms_px=estimate.solution.rms_px,
+        )
+
+
+def decoded(frame: CameraFrame) -> U8 | None:
+    """Pixels (H, W) or (H, W, 3) BGR of a frame; None for damaged ones and for H.264, which its source decodes."""
+    data = np.frombuffer(frame.data, np.uint8)
+    if frame.encoding in (Encoding.JPEG, Encoding.PNG):
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        return None if image is None else np.asarray(image, np.uint8)
+    shape = (frame.height, frame.width) if frame.encoding is Encoding.MONO8 else (frame.height, frame.width, 3)
+    if frame.encoding is Encoding.H264 or data.size != int(np.prod(shape)):
+        return None
+    return data.reshape(shape)
+
+
+def _rgb(image: U8) -> U8:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
