@@ -54,7 +54,7 @@ def test_the_url_sets_every_part() -> None:
         "sim:plain?seed=3&duration=5&imu=perfect&imu.vibration=1&gnss.multipath=0&gnss.outage=1-2&base=off"
         "&flight.mission=stand&clock=perfect&extrinsics.antenna_m=0&mavlink.lost=0.5"
     ).aircraft.options
-    assert (options.seed, options.duration, options.off) == (3, 5.0, ("base",))
+    assert (options.seed, options.duration, set(options.off)) == (3, 5.0, {"base", "camera"})
     assert (options.imu.vibration, options.imu.accel_noise_ug, options.imu.bits) == (1.0, 0.0, 0)
     assert (options.gnss.multipath, options.gnss.outage, options.base.rate_hz) == (0.0, "1-2", 1.0)
     assert (options.flight.mission, options.clock.drift_ppm) == ("stand", 0.0)
@@ -70,7 +70,7 @@ def test_the_order_of_options_does_not_matter() -> None:
 @pytest.mark.parametrize(
     ("url", "said"),
     [
-        ("sim:race", "there is no site 'race'; there are survey, plain"),
+        ("sim:race", "there is no site 'race'; there are survey, plain, playground"),
         ("sim:plain?gnss.multipaht=0", "gnss.multipaht is not a setting; did you mean multipath?"),
         ("sim:plain?gnss.multipath=-1", "gnss.multipath is -1.0; allowed: 0.0 to 1000.0"),
         ("sim:plain?gnss.multipath=much", "gnss.multipath is 'much'; allowed: a number"),
@@ -84,6 +84,7 @@ def test_the_order_of_options_does_not_matter() -> None:
         ("sim:plain?imu=good", "imu is 'good'; allowed: perfect or off or one of its options"),
         ("sim:plain?flight=off", "flight is 'off'; allowed: one of its options: flight.mission"),
         ("sim:plain?off=imu", "off is 'imu'; allowed: imu=off"),
+        ("sim:plain?camera=perfect", "this site has nothing to see; allowed: camera=off"),
         ("sim:plain?flight.mission=dance", "flight.mission is 'dance'; allowed: 'survey', 'hover', 'stand'"),
         ("sim:plain?flight.waypoints=1,2", "waypoints has '1,2'"),
         ("sim:plain?base.jamming=x", "option 'jamming' is 'x'"),

@@ -56,7 +56,7 @@ class _Delays:
     gnss: float = 0.0
     imu: float = 0.0
     mavlink: float = 0.0
-    camera: float = 0.0
+    down: float = 0.0
 
 
 @dataclass(frozen=True)

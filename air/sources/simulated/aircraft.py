@@ -27,10 +27,13 @@ from air.sources.simulated.ground import Ground
 from air.sources.simulated.imu import SimulatedImu
 from air.sources.simulated.multirotor import fly
 from air.sources.simulated.options import SimulationOptions
+from air.sources.simulated.site import Site
 from air.sources.simulated.sky import Sky
 from air.sources.simulated.survey import START_NS
 from air.sources.simulated.telemetry import SimulatedTelemetry
+from air.sources.simulated.video import SimulatedCamera, draw_lens
 from common.arrays import F64
+from common.errors import SourceError
 from common.geo import T_ecef_enu
 from common.measurements import CameraFrame
 from common.messages import Datum
@@ -43,11 +46,19 @@ BASE_MAST = 2.0
 IMU_HEIGHT = 0.25
 """Where the base station stands, from home, and how high its antenna and the standing aircraft's IMU are, m."""
 
-Packets = Iterable[tuple[float, bytes]]
+_LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT = 30.5355, 114.3655, 62.0
+
+CAMERA = "down"
+"""Name of the camera."""
 
 
 class _Sender(Protocol):
     def packets(self) -> Iterator[tuple[float, bytes]]: ...
+
+
+def datum_of(seed: int) -> Datum:
+    """The datum of a flight at a site that lies nowhere in particular."""
+    return Datum(f"2024-06-01T09-00-00-sim{seed}", _LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT)
 
 
 @dataclass(frozen=True)
@@ -68,12 +79,15 @@ class Aircraft:
         self.start_ns = START_NS
         self.home = np.array([0.0, 0.0, float(ground.height(np.zeros((1, 2)))[0]) + IMU_HEIGHT])
         self.trajectory, self.mission = fly(options.flight, options.seed, options.duration, self.home)
+        self.lens, self.nominal_lens = draw_lens(options.camera, options.seed)
         self.extrinsics, self.nominal_extrinsics = draw_extrinsics(options.extrinsics, options.seed)
         self.clocks = {
             device: DeviceClock.draw(options.clock, options.seed, device, options.duration)
             for device in (Device.HOST, Device.IMU, Device.CAMERA, Device.VEHICLE)
         }
         self.sky = Sky(constellation(options.gnss, START_NS, options.seed), options.gnss, datum, START_NS, options.seed)
+        if "camera" not in options.off and self.site is None:
+            raise SourceError("option 'camera': this site has nothing to see; allowed: camera=off")
         self.receiver()  # an impossible option of theirs is told at once
         self.base()
 
@@ -117,6 +131,20 @@ class Aircraft:
         options, clock = self.options, self.clocks[Device.VEHICLE]
         return SimulatedTelemetry(self.trajectory, self.mission, self.datum, options.mavlink, options.seed, clock)
 
+    @property
+    def site(self) -> Site | None:
+        """The ground, where there is something to see."""
+        return self.ground if isinstance(self.ground, Site) else None
+
+    def camera(self) -> SimulatedCamera:
+        """The video camera, at the start of the flight, of an aircraft that has one."""
+        assert self.site is not None
+        options, T_body_cam = self.options, self.extrinsics.T_body_cam
+        clock = self.clocks[Device.CAMERA]
+        return SimulatedCamera(
+            self.site, self.trajectory, T_body_cam, self.lens, options.camera, options.seed, clock, CAMERA
+        )
+
     def drivers(self) -> dict[str, Driver]:
         """New drivers of the devices that are there, by name."""
         drivers = (XsensImu("imu"), UbloxReceiver("gnss"), UbloxReceiver("base"), MavlinkVehicle("mavlink"))
@@ -150,14 +178,19 @@ class Aircraft:
                 packets = self.sent(name)
                 delay = TransportDelay(options.clock, options.seed, device)
                 yield _arriving(name, packets if baud is None else _read(packets, baud), delay)
+        if "camera" not in options.off:
+            delay = TransportDelay(options.clock, options.seed, Device.CAMERA)
+            yield _arriving(CAMERA, self.camera().frames(), delay)
 
 
-def _arriving(name: str, packets: Packets, delay: TransportDelay) -> Iterator[Arrival]:
+def _arriving(
+    name: str, packets: Iterable[tuple[float, bytes | CameraFrame]], delay: TransportDelay
+) -> Iterator[Arrival]:
     for t_s, data in packets:
         yield Arrival(delay.arrival_s(t_s), name, data)
 
 
-def _read(packets: Packets, baud: int) -> Iterator[tuple[float, bytes]]:
+def _read(packets: Iterable[tuple[float, bytes]], baud: int) -> Iterator[tuple[float, bytes]]:
     """What a serial port's bridge hands over when, of messages that follow each other on a line."""
     filled = 0
     for t_s, data in packets:

@@ -18,15 +18,22 @@ import numpy as np
 
 from air.sources.simulated.aircraft import Aircraft
 from air.sources.simulated.gnss import Observed
+from air.sources.simulated.site import Site
+from air.sources.simulated.surface import CELL
 from common.errors import ExportError
 from common.export.datum import write_datum
+from common.export.laz import write_points
+from common.export.raster import write_dsm
+from common.export.surface import Surface
 from common.export.trajectory import tum_line
+from common.messages import Datum
 from common.recording.reader import Recording
 from common.se3 import SE3, matrix_to_quaternion
 
 TRUTH = "truth"
 """What stands before the names of the tables in a recording."""
 RATE_HZ = 200
+CLOUD_SPACING = 0.1
 STATE, CLOCKS, SATELLITES = "state", "clocks", "satellites"
 _STEP_NS = 1_000_000_000 // RATE_HZ
 _SECOND_NS = 1_000_000_000
@@ -106,13 +113,15 @@ class FlightTruth:
             "T_body_cam": aircraft.extrinsics.T_body_cam.matrix.tolist(),
             "p_body_antenna": aircraft.extrinsics.p_body_antenna.tolist(),
             "p_world_base": aircraft.p_base.tolist(),
+            "camera": None if "camera" in options.off else asdict(aircraft.lens),
             "scale_accel": imu.scale_accel.tolist(),
             "scale_gyro": imu.scale_gyro.tolist(),
             "imu_stamp_delay_s": options.imu.delay_s,
         }
 
     def write(self, folder: Path) -> None:
-        """Write trajectory.tum (body in world), state.csv, clocks.csv, satellites.csv, flight.json and datum.json.
+        """Write trajectory.tum (body in world), state.csv, clocks.csv, satellites.csv, flight.json and datum.json;
+        where there is something to see, its surface as surface.laz and dsm.tif.
 
         Raises ExportError when a file cannot be written.
         """
@@ -122,6 +131,8 @@ class FlightTruth:
             text = json.dumps(self.constants(), indent=2) + "\n"
             (folder / "flight.json").write_text(text, encoding="utf-8")
             write_rows(folder, self.rows())
+            if self._aircraft.site is not None:
+                write_surface(folder, self._aircraft.site, self._aircraft.datum)
         except OSError as error:
             raise ExportError(f"{folder}: the truth cannot be written: {error.strerror}") from error
 
@@ -139,6 +150,19 @@ def write_rows(folder: Path, rows: Iterable[Row]) -> None:
             writers[row.table].writerow(row.values)
             if row.table == STATE:
                 tum.write(tum_line(row.t_ns, pose_of(row)))
+
+
+def write_surface(folder: Path, site: Site, datum: Datum) -> None:
+    """Write surface.laz, points every 0.1 m with their colours, and dsm.tif; what moves is left out."""
+    strips = list(site.cloud(CLOUD_SPACING))
+    p_world, colour = (np.concatenate([strip[i] for strip in strips]) for i in range(2))
+    write_points(folder / "surface.laz", p_world, colour.astype(np.uint8), datum)
+    height = site.dsm()
+    west, south = site.bounds.west - CELL / 2, site.bounds.south - CELL / 2  # nodes are the middles of cells
+    zeros = np.zeros(height.shape, np.uint8)
+    blank = np.zeros((*height.shape, 3), np.uint8)
+    surface = Surface(CELL, west, south, height, zeros.astype(np.float32), blank, zeros, zeros.astype(bool))
+    write_dsm(folder / "dsm.tif", surface, datum)
 
 
 def recorded_states(path: Path) -> Iterator[Row]:

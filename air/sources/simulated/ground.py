@@ -6,11 +6,17 @@ from typing import Protocol
 
 import numpy as np
 
+from air.sources.simulated.layout import Bounds
+from air.sources.simulated.mission import plan
+from air.sources.simulated.options import PLAIN, SimulationOptions
+from air.sources.simulated.sites import SITES as WORLDS
+from air.sources.simulated.sites import generate_site
 from common.arrays import F64, Bool
-from common.messages import Datum
 
-SITES = ("plain",)
-_LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT = 30.5355, 114.3655, 62.0
+SITES = (PLAIN, *WORLDS)
+_MARGIN, _REACH = 25.0, 1.25
+"""How far beyond its way an aircraft sees, m, and for each metre that it is high."""
+_CELL = 2.0
 
 
 class Ground(Protocol):
@@ -37,6 +43,16 @@ class Plain:
         return np.asarray(directions[:, 2] < 0)
 
 
-def open_ground(name: str, seed: int) -> tuple[Ground, Datum]:
-    """The ground of a name in SITES, and the datum of a flight there."""
-    return Plain(), Datum(f"2024-06-01T09-00-00-sim{seed}", _LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT)
+def open_ground(options: SimulationOptions, site: str) -> Ground:
+    """The ground of a site, as far as the flight and its camera reach. A world takes some seconds to be made."""
+    return Plain() if site == PLAIN else generate_site(options.world, options.seed, reach_of(options))
+
+
+def reach_of(options: SimulationOptions) -> Bounds:
+    """Bounds of all that a flight sees, in whole cells."""
+    p = plan(options.flight, options.duration).p
+    margin = _MARGIN + _REACH * float(p[:, 2].max())
+    low, high = p[:, :2].min(axis=0) - margin, p[:, :2].max(axis=0) + margin
+    west, south = (float(value) for value in np.floor(low / _CELL) * _CELL)
+    east, north = (float(value) for value in np.ceil(high / _CELL) * _CELL)
+    return Bounds(west, south, east, north)

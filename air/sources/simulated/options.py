@@ -12,12 +12,16 @@ from air.sources.simulated.extrinsics import ExtrinsicsOptions
 from air.sources.simulated.gnss_options import GnssOptions
 from air.sources.simulated.imu import ImuOptions
 from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.sites import WorldOptions
 from air.sources.simulated.telemetry import MavlinkOptions
+from air.sources.simulated.video import CameraOptions
 from common.config import Range, parse
 from common.errors import ConfigError, SourceError
 
+PLAIN = "plain"
+"""The site with nothing on it to see, whose camera stays at home."""
 PERFECT, OFF = "perfect", "off"
-DEVICES = ("imu", "gnss", "base", "mavlink")
+DEVICES = ("imu", "gnss", "base", "mavlink", "camera")
 """What can be left at home: `base=off`."""
 
 
@@ -27,11 +31,13 @@ class SimulationOptions:
 
     seed: Annotated[int, Range(0, 2**31 - 1)] = 1
     duration: Annotated[float, Range(1.0, 7200.0)] = 300.0
+    world: WorldOptions = field(default_factory=WorldOptions)
     flight: FlightOptions = field(default_factory=FlightOptions)
     imu: ImuOptions = field(default_factory=ImuOptions)
     gnss: GnssOptions = field(default_factory=GnssOptions)
     base: GnssOptions = field(default_factory=GnssOptions.base)
     mavlink: MavlinkOptions = field(default_factory=MavlinkOptions)
+    camera: CameraOptions = field(default_factory=CameraOptions)
     clock: ClockOptions = field(default_factory=ClockOptions)
     extrinsics: ExtrinsicsOptions = field(default_factory=ExtrinsicsOptions)
     off: tuple[str, ...] = ()
@@ -41,8 +47,8 @@ _HINTS = get_type_hints(SimulationOptions)
 _PARTS = {name: hint for name, hint in _HINTS.items() if isinstance(hint, type) and is_dataclass(hint)}
 
 
-def parse_options(url: str, query: str) -> SimulationOptions:
-    """The options of a query `key=value&part.key=value&part=perfect&device=off`.
+def parse_options(url: str, site: str, query: str) -> SimulationOptions:
+    """The options of a flight at a site, of a query `key=value&part.key=value&part=perfect&device=off`.
 
     Raises SourceError, in one line, for an option that is unknown, impossible or given twice.
     """
@@ -51,6 +57,10 @@ def parse_options(url: str, query: str) -> SimulationOptions:
         if key in given:
             raise SourceError(f"source {url!r}: option {key!r} is given twice; give it once")
         given[key] = text
+    if site == PLAIN:
+        given.setdefault("camera", OFF)
+    else:
+        given["world.site"] = site
     try:
         return parse(_table(given), SimulationOptions)
     except ConfigError as error:
