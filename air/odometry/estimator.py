@@ -28,7 +28,6 @@ AGAIN = Sigmas(tilt=0.02, yaw=0.02, position=0.5, velocity=0.5, accel_bias=0.05,
 """How well the IMU's prediction is known where the window starts anew."""
 HALF_GYRO_NS = 10_000_000
 RETRY_S = 5.0
-MIN_STILL_S = 0.09
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,8 @@ class Estimator:
         self._initialization = self._new_initialization()
         self._monitor = Monitor(self._settings.degradation)
         self._propagation: Propagation | None = None
-        self._last: TrackedFrame | None = None
+        self._frame_ns = 0
+        self._recent: list[TrackedFrame] = []
         self._repaired_ns = -(10**18)
         self.revision = 0
 
@@ -82,6 +82,11 @@ class Estimator:
         """The state at a sample, by the IMU from the last frame on; None while there is none."""
         if not self.buffer.add(sample) or self._propagation is None:
             return None
+        if (sample.t_ns - self._frame_ns) * 1e-9 > self._settings.degradation.alone_s:
+            self._window, self._propagation = None, None
+            self._initialization = self._new_initialization()
+            self.revision += 1
+            return None
         pieces = self.buffer.between(self._propagation.state.t_ns, sample.t_ns)
         self._propagation.advance(pieces)
         return self._propagation.state
@@ -95,9 +100,9 @@ class Estimator:
 
     def add_frame(self, frame: TrackedFrame) -> Estimate | Refusal:
         """The estimate at a frame that IMU samples cover, or why there is none."""
-        outcome = self._begin(frame) if self._window is None else self._continue(self._window, frame)
-        self._last = frame
-        return outcome
+        self._frame_ns = frame.t_ns
+        self._remember(frame)
+        return self._begin(frame) if self._window is None else self._continue(self._window, frame)
 
     def _begin(self, frame: TrackedFrame) -> Estimate | Refusal:
         initial = self._initialization.feed(frame)
@@ -138,11 +143,7 @@ class Estimator:
 
     def _join(self, window: Window, before: InertialState) -> None:
         """Place what began anew where the IMU says that the aircraft is."""
-        t_ns = window.state().t_ns
-        back = (
-            self._integrator.predict(before, self.buffer.between(before.t_ns, t_ns)) if t_ns > before.t_ns else before
-        )
-        window.move(_level_between(window.state().T_world_body, back.T_world_body))
+        window.move(_level_between(window.state().T_world_body, before.T_world_body))
         self.revision += 1
 
     def _continue(self, window: Window, frame: TrackedFrame) -> Estimate | Refusal:
@@ -179,15 +180,19 @@ class Estimator:
         R = self._T_body_cam.R.T
         return ideal_points(frame, self._focal, R @ omega, R @ v_body, depths)
 
+    def _remember(self, frame: TrackedFrame) -> None:
+        """Keep the frames since just before the time that tells whether the aircraft stands."""
+        self._recent.append(frame)
+        begin_ns = frame.t_ns - round(self._settings.initialization.still_s * 1e9)
+        while self._recent[1:] and self._recent[1].t_ns <= begin_ns:
+            self._recent.pop(0)
+
     def _is_still(self, frame: TrackedFrame) -> bool:
-        last = self._last
-        if last is None or (frame.t_ns - last.t_ns) * 1e-9 < MIN_STILL_S:
+        """Whether the aircraft stood for long enough: over a shorter time slow flight looks alike."""
+        s, first_ns = self._settings.initialization, self._recent[0].t_ns
+        if frame.t_ns - first_ns < round(s.still_s * 1e9):
             return False
-        samples = self.buffer.samples(last.t_ns, frame.t_ns)
-        if not moving(samples, [last, frame], self._focal, self._settings.initialization):
-            turn = np.mean([s.gyro for s in samples], axis=0) - self.gyro_bias()
-            return bool(np.linalg.norm(turn) < self._settings.initialization.still_gyro)
-        return False
+        return not moving(self.buffer.samples(first_ns, frame.t_ns), self._recent, self._focal, s)
 
     # When it goes wrong
 

@@ -57,12 +57,13 @@ def initial_in_motion(
     imu: ImuSettings,
 ) -> Initial | Refusal:
     """States of all frames. Rays of the first and the last must open wide enough, and the speed change enough."""
-    angle = parallax(frames[0], frames[-1], buffer, T_body_cam)
-    if not angle > np.radians(settings.parallax_deg):
-        return Refusal(f"the image has moved by {np.degrees(angle):.1f}° so far")
     gyro_bias = gyro_bias_of(frames, buffer, T_body_cam.R, focal, imu)
     if np.linalg.norm(gyro_bias) > 4 * imu.gyro_bias_sigma:
         return Refusal("the image turns otherwise than the gyroscope")
+    turned = buffer.between(frames[0].t_ns, frames[-1].t_ns).turn(gyro_bias)
+    angle = parallax(frames[0], frames[-1], T_body_cam.R.T @ turned @ T_body_cam.R)
+    if not angle > np.radians(settings.parallax_deg):
+        return Refusal(f"the image has moved by {np.degrees(angle):.1f}° so far")
     motion = _integrate(frames, buffer, gyro_bias, imu)
     seen = _seen(frames, motion, T_body_cam)
     if seen is None:
@@ -82,12 +83,11 @@ def initial_in_motion(
     return Initial(states, frames, sigmas)
 
 
-def parallax(first: TrackedFrame, last: TrackedFrame, buffer: ImuBuffer, T_body_cam: SE3) -> float:
-    """Median angle rad between the rays of the common points beyond what turning does; NaN with few of them."""
+def parallax(first: TrackedFrame, last: TrackedFrame, R_first_last: F64) -> float:
+    """Median angle rad between the rays of the common points beyond a turn of the camera; NaN with few of them."""
     a, b = common_rays(first, last)
     if len(a) < MIN_POINTS:
         return float("nan")
-    R_first_last = T_body_cam.R.T @ buffer.between(first.t_ns, last.t_ns).turn(np.zeros(3)) @ T_body_cam.R
     return float(np.median(np.arccos(np.clip(np.sum(a * (b @ R_first_last.T), axis=1), -1.0, 1.0))))
 
 

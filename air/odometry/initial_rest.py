@@ -14,7 +14,9 @@ from air.odometry.tracker import TrackedFrame
 from common.measurements import ImuSample
 from common.se3 import SE3
 
-MIN_SAMPLES = 20
+MIN_SAMPLES, MIN_POINTS = 20, 12
+SHAKEN = 15.0
+"""How much more than a quiet IMU one may move while the image stays."""
 STILL_SPEED, STILL_TURN = 0.02, 0.002
 
 
@@ -44,16 +46,21 @@ def moving(
 ) -> str:
     """Why an aircraft is not at rest; empty when it is.
 
-    Calm flight may feel like standing, so the points in the image must stay as well; an image without any says nothing.
+    An image in which all points stay speaks for itself, also while idling rotors shake the IMU; without such an image
+    the IMU must be quiet.
     """
     if len(samples) < MIN_SAMPLES or not frames:
         return "there are too few samples"
+    pairs = [common_rays(frames[0], frame) for frame in frames]
+    seen = min(len(first) for first, _ in pairs) >= MIN_POINTS
+    if not seen and len(frames[0].ids) >= MIN_POINTS:
+        return "the image has changed"
+    flow = max(focal * float(np.median(np.linalg.norm(a - b, axis=1))) for a, b in pairs) if seen else 0.0
+    if flow > settings.still_px:
+        return f"the image moves by {flow:.1f} px"
     accel, gyro = np.array([s.accel for s in samples]), np.array([s.gyro for s in samples])
     shaken, turned = float(accel.std(axis=0).max()), float(gyro.std(axis=0).max())
-    if shaken > settings.still_accel or turned > settings.still_gyro:
+    allowed = SHAKEN if seen else 1.0
+    if shaken > allowed * settings.still_accel or turned > allowed * settings.still_gyro:
         return f"the IMU moves by {shaken:.2f} m/s² and {turned:.4f} rad/s"
-    first, last = common_rays(frames[0], frames[-1])
-    flow = focal * float(np.median(np.linalg.norm(first - last, axis=1))) if len(first) else 0.0
-    if flow > settings.still_px or (len(frames[0].ids) and not len(first)):
-        return f"the image moves by {flow:.1f} px"
     return ""

@@ -74,16 +74,16 @@ class WindowSettings:
 class InitializationSettings:
     """When the odometry may begin.
 
-    At rest: after `still_s` in which accelerations and rates have standard deviations below `still_accel` m/s² and
-    `still_gyro` rad/s, and the image moves by less than `still_px`. In motion: from `frames` of the last `span_s` at
-    most, between which points moved by `parallax_deg`, when the adjustment knows the scale within `scale_sigma`; tried
-    every `try_every_s`.
+    At rest: after `still_s` in which the image moves by less than `still_px`; where it shows nothing, accelerations and
+    rates must have standard deviations below `still_accel` m/s² and `still_gyro` rad/s. In motion: from `frames` of the
+    last `span_s` at most, between which points moved by `parallax_deg`, when the adjustment knows the scale within
+    `scale_sigma`; tried every `try_every_s`.
     """
 
     still_s: Annotated[float, Range(0.2, 60.0)] = 1.0
     still_accel: Annotated[float, Range(0.001, 10.0)] = 0.15
     still_gyro: Annotated[float, Range(0.0001, 1.0)] = 0.01
-    still_px: Annotated[float, Range(0.1, 20.0)] = 1.0
+    still_px: Annotated[float, Range(0.1, 20.0)] = 1.2
     frames: Annotated[int, Range(5, 40)] = 10
     span_s: Annotated[float, Range(0.5, 20.0)] = 3.0
     parallax_deg: Annotated[float, Range(0.1, 45.0)] = 3.0
@@ -96,8 +96,8 @@ class DegradationSettings:
     """When a part of the estimate counts as lost and as back, and what cannot be true.
 
     The camera is lost after `lost_s` with fewer than `few_points`, and back after `back_s` with `enough_points`; GNSS
-    likewise. A jump of the velocity against the IMU by `velocity_jump` m/s from one frame to the next, and biases of
-    more than `bias_sigmas`, are impossible.
+    likewise. After `alone_s` without a frame the IMU alone is no longer believed. A jump of the velocity against the
+    IMU by `velocity_jump` m/s from one frame to the next, and biases of more than `bias_sigmas`, are impossible.
     """
 
     few_points: Annotated[int, Range(0, 1000)] = 8
@@ -106,6 +106,7 @@ class DegradationSettings:
     enough_satellites: Annotated[int, Range(1, 100)] = 6
     lost_s: Annotated[float, Range(0.0, 60.0)] = 1.0
     back_s: Annotated[float, Range(0.0, 60.0)] = 0.5
+    alone_s: Annotated[float, Range(0.1, 600.0)] = 10.0
     velocity_jump: Annotated[float, Range(0.1, 100.0)] = 2.0
     bias_sigmas: Annotated[float, Range(1.0, 100.0)] = 6.0
 

@@ -30,7 +30,7 @@ WEAK = 100.0
 """Sigma of the prior of a point, in distances of the point."""
 TRIALS, SETTLING = 5, 6
 """How many undetermined points are removed before a solution is given up."""
-STILL_SPEED, STILL_TURN, STILL_SHIFT = 0.02, 0.002, 0.005
+STILL_SPEED, STILL_TURN, STILL_SHIFT = 0.05, 0.002, 0.005
 """How far the aircraft moves while it stands, m/s, rad and m."""
 
 
