@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from air.odometry.degradation import Monitor
-from air.odometry.initial import Refusal
+from air.odometry.initial import KnownSpeed, Refusal
 from air.odometry.initial_prior import Sigmas
 from air.odometry.initial_rest import moving
 from air.odometry.initialization import Initialization
@@ -91,6 +91,11 @@ class Estimator:
         self._propagation.advance(pieces)
         return self._propagation.state
 
+    def add_speed(self, speed: KnownSpeed) -> None:
+        """Note how fast the aircraft moves: of use where it begins in flight."""
+        if self._window is None:
+            self._initialization.add_speed(speed)
+
     def _propagate_from(self, state: InertialState) -> None:
         self._propagation = Propagation(self._integrator, state)
         if (last_ns := self.buffer.last_ns) is not None:
@@ -166,7 +171,8 @@ class Estimator:
         note: str = "",
     ) -> Estimate:
         newest = window.frames[-1]
-        points = len(newest.xy) if still else len(newest.factors)
+        # An aircraft that stands needs no points to know where it is.
+        points = self._settings.degradation.enough_points if still else len(newest.factors)
         mode = self._monitor.update(newest.t_ns, points)
         return Estimate(window.state(), window.pose_covariance, mode, self.revision, solution, keyframe, note)
 

@@ -23,6 +23,15 @@ class Initial:
 
 
 @dataclass(frozen=True)
+class KnownSpeed:
+    """How fast the aircraft moves, m/s, with one sigma."""
+
+    t_ns: int
+    speed: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Refusal:
     """Why there are no states yet, in a few words."""
 

@@ -12,13 +12,13 @@ Estimator initialization in vision-aided inertial navigation with unknown camera
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 
-from air.odometry.initial import Initial, Refusal, common_rays, level
+from air.odometry.initial import Initial, KnownSpeed, Refusal, common_rays, level
 from air.odometry.initial_prior import Sigmas
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator
 from air.odometry.settings import ImuSettings, InitializationSettings
@@ -55,8 +55,12 @@ def initial_in_motion(
     focal: float,
     settings: InitializationSettings,
     imu: ImuSettings,
+    speed: KnownSpeed | None = None,
 ) -> Initial | Refusal:
-    """States of all frames. Rays of the first and the last must open wide enough, and the speed change enough."""
+    """States of all frames. Rays of the first and the last must open wide enough, and the speed change enough.
+
+    A known `speed` at the first frame, of several sigmas, tells the scale in steady flight too.
+    """
     gyro_bias = gyro_bias_of(frames, buffer, T_body_cam.R, focal, imu)
     if np.linalg.norm(gyro_bias) > 4 * imu.gyro_bias_sigma:
         return Refusal("the image turns otherwise than the gyroscope")
@@ -64,12 +68,14 @@ def initial_in_motion(
     angle = parallax(frames[0], frames[-1], T_body_cam.R.T @ turned @ T_body_cam.R)
     if not angle > np.radians(settings.parallax_deg):
         return Refusal(f"the image has moved by {np.degrees(angle):.1f}° so far")
-    motion = _integrate(frames, buffer, gyro_bias, imu)
+    motion, sigma_v = _integrate(frames, buffer, gyro_bias, imu), LOOSE_VELOCITY
     seen = _seen(frames, motion, T_body_cam)
     if seen is None:
         return Refusal("too few points are seen long enough")
     aligned = _align(seen, motion, T_body_cam, imu.gravity)
-    if aligned is None or not aligned.one_over_scale > SIGNIFICANT * aligned.sigma:
+    if aligned is not None and speed is not None and speed.speed > SIGNIFICANT * speed.sigma:
+        aligned, sigma_v = aligned.of_speed(speed), speed.sigma
+    elif aligned is None or not aligned.one_over_scale > SIGNIFICANT * aligned.sigma:
         return Refusal("there was too little acceleration to tell the scale")
     R_world_first = level(-aligned.down)
     gravity = imu.gravity * aligned.down
@@ -79,7 +85,7 @@ def initial_in_motion(
         p = R_world_first @ (aligned.v_first * t + gravity * t**2 / 2 + motion.p[i])
         v = R_world_first @ (aligned.v_first + gravity * t + motion.v[i])
         states.append(InertialState(frame.t_ns, SE3(R_world_first @ motion.R[i], p), v, np.zeros(3), gyro_bias))
-    sigmas = Sigmas(LOOSE_TILT, 1e-4, 1e-3, LOOSE_VELOCITY, imu.accel_bias_sigma, imu.gyro_bias_sigma)
+    sigmas = Sigmas(LOOSE_TILT, 1e-4, 1e-3, sigma_v, imu.accel_bias_sigma, imu.gyro_bias_sigma)
     return Initial(states, frames, sigmas)
 
 
@@ -166,6 +172,11 @@ class _Aligned:
     down: F64
     one_over_scale: float
     sigma: float
+
+    def of_speed(self, known: KnownSpeed) -> _Aligned:
+        """The same with the scale that a speed asks for."""
+        factor = known.speed / max(float(np.linalg.norm(self.v_first)), 1e-9)
+        return replace(self, v_first=self.v_first * factor, one_over_scale=self.one_over_scale / factor)
 
 
 def _align(seen: _Seen, motion: _Motion, T_body_cam: SE3, gravity: float) -> _Aligned | None:

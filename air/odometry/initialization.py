@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from air.odometry.initial import Initial, Refusal
+from air.odometry.initial import Initial, KnownSpeed, Refusal
 from air.odometry.initial_motion import initial_in_motion
 from air.odometry.initial_rest import initial_at_rest
 from air.odometry.preintegration import ImuBuffer
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import TrackedFrame
 from common.se3 import SE3
+
+NEAR_NS = 300_000_000
 
 
 class Initialization:
@@ -19,7 +21,12 @@ class Initialization:
     def __init__(self, focal: float, T_body_cam: SE3, buffer: ImuBuffer, settings: OdometrySettings) -> None:
         self._focal, self._T_body_cam, self._buffer, self._settings = focal, T_body_cam, buffer, settings
         self._frames: list[TrackedFrame] = []
+        self._speeds: list[KnownSpeed] = []
         self._tried_ns = 0
+
+    def add_speed(self, speed: KnownSpeed) -> None:
+        """Note what somebody else, such as a GNSS receiver, says about the speed: in steady flight the IMU cannot."""
+        self._speeds = [s for s in self._speeds if speed.t_ns - s.t_ns < 60_000_000_000] + [speed]
 
     def feed(self, frame: TrackedFrame) -> Initial | Refusal:
         """States of this frame, or of several frames up to it; or why there are none yet."""
@@ -49,4 +56,6 @@ class Initialization:
             return Refusal("too few frames were seen so far")
         chosen = np.unique(np.round(np.linspace(0, len(frames) - 1, s.frames)).astype(int)).tolist()
         picked = [frames[i] for i in chosen]
-        return initial_in_motion(picked, self._buffer, self._T_body_cam, self._focal, s, self._settings.imu)
+        near = [v for v in self._speeds if abs(v.t_ns - picked[0].t_ns) < NEAR_NS]
+        speed = min(near, key=lambda v: abs(v.t_ns - picked[0].t_ns)) if near else None
+        return initial_in_motion(picked, self._buffer, self._T_body_cam, self._focal, s, self._settings.imu, speed)

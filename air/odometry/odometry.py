@@ -9,18 +9,20 @@ import numpy as np
 
 from air.alignment.prepare import thumbnail
 from air.odometry.estimator import Estimate, Estimator
-from air.odometry.initial import Refusal
+from air.odometry.initial import KnownSpeed, Refusal
 from air.odometry.preintegration import InertialState
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import Tracker
 from air.sensors.calibration import Calibration
 from common.arrays import F64, U8
-from common.measurements import CameraFrame, Encoding, ImuSample, Measurement
+from common.measurements import CameraFrame, Encoding, ImuSample, Measurement, ReceiverSolution
 from common.messages import EstimatorState, Keyframe, Mode, Photo, Pose
 
 Output = Pose | Keyframe | EstimatorState
 WAITING = 60
 """Frames that wait for the IMU; older ones are given up."""
+MIN_SIGMA_SPEED = 0.1
+"""m/s; receivers are confident."""
 EVERY_NS = 1_000_000_000
 """Between two `EstimatorState`."""
 
@@ -61,6 +63,9 @@ class Odometry:
             state = self.estimator.add_imu(message)
             poses: list[Output] = [] if state is None else [self._pose(state)]
             return poses + self._frames()
+        if isinstance(message, ReceiverSolution) and np.isfinite([*message.v_enu, message.sigma_velocity]).all():
+            speed = float(np.linalg.norm(message.v_enu))
+            self.estimator.add_speed(KnownSpeed(message.t_ns, speed, max(message.sigma_velocity, MIN_SIGMA_SPEED)))
         return []
 
     def _frames(self) -> list[Output]:

@@ -36,9 +36,9 @@ class ImuSettings:
     out of range, the noise is `doubtful_*`. `gravity` m/s².
     """
 
-    accel_noise: Annotated[float, Range(1e-6, 10.0)] = 0.01
-    gyro_noise: Annotated[float, Range(1e-7, 1.0)] = 0.0005
-    accel_bias_walk: Annotated[float, Range(1e-8, 1.0)] = 0.001
+    accel_noise: Annotated[float, Range(1e-6, 10.0)] = 0.003
+    gyro_noise: Annotated[float, Range(1e-7, 1.0)] = 0.0003
+    accel_bias_walk: Annotated[float, Range(1e-8, 1.0)] = 0.0005
     gyro_bias_walk: Annotated[float, Range(1e-9, 0.1)] = 2e-5
     accel_bias_sigma: Annotated[float, Range(1e-4, 10.0)] = 0.1
     gyro_bias_sigma: Annotated[float, Range(1e-5, 1.0)] = 0.05
@@ -84,11 +84,11 @@ class InitializationSettings:
     still_accel: Annotated[float, Range(0.001, 10.0)] = 0.15
     still_gyro: Annotated[float, Range(0.0001, 1.0)] = 0.01
     still_px: Annotated[float, Range(0.1, 20.0)] = 1.2
-    frames: Annotated[int, Range(5, 40)] = 10
-    span_s: Annotated[float, Range(0.5, 20.0)] = 3.0
+    frames: Annotated[int, Range(5, 40)] = 12
+    span_s: Annotated[float, Range(0.5, 20.0)] = 6.0
     parallax_deg: Annotated[float, Range(0.1, 45.0)] = 3.0
-    scale_sigma: Annotated[float, Range(0.001, 1.0)] = 0.15
-    try_every_s: Annotated[float, Range(0.0, 10.0)] = 0.3
+    scale_sigma: Annotated[float, Range(0.001, 1.0)] = 0.2
+    try_every_s: Annotated[float, Range(0.0, 10.0)] = 0.5
 
 
 @dataclass(frozen=True)
