@@ -66,6 +66,13 @@ def _parser() -> argparse.ArgumentParser:
     position.add_argument("--quiet", action="store_true", help="no progress bar")
     position.set_defaults(run=_position)
 
+    odometry = commands.add_parser("odometry", help="trajectory of a flight with a camera and an IMU, as files")
+    odometry.add_argument("source", metavar="SOURCE", help="with frames and IMU samples, e.g. euroc:DIR or F.mcap")
+    odometry.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
+    odometry.add_argument("--calibration", type=Path, metavar="F", help="of the camera, where the source has none")
+    odometry.add_argument("--quiet", action="store_true", help="no progress bar")
+    odometry.set_defaults(run=_odometry)
+
     record = commands.add_parser("record", help="record everything on the bus into a file until it is stopped")
     record.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the recording")
     record.set_defaults(run=_record)
@@ -163,6 +170,18 @@ def _position(args: argparse.Namespace) -> int:
         print(line)
     for problem in source.problems:
         print(f"{problem.name}: {problem.text}", file=sys.stderr)
+    return 0
+
+
+def _odometry(args: argparse.Namespace) -> int:
+    from air.odometry.settings import OdometrySettings
+    from air.trajectory import find_trajectory, in_words
+
+    report = find_trajectory(args.source, args.out, args.calibration, OdometrySettings(), args.quiet)
+    for problem in report.problems:
+        print(f"{problem['name']}: {problem['text']}", file=sys.stderr)
+    for line in in_words(report):
+        print(line)
     return 0
 
 

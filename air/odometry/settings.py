@@ -106,7 +106,7 @@ class DegradationSettings:
     enough_satellites: Annotated[int, Range(1, 100)] = 6
     lost_s: Annotated[float, Range(0.0, 60.0)] = 1.0
     back_s: Annotated[float, Range(0.0, 60.0)] = 0.5
-    alone_s: Annotated[float, Range(0.1, 600.0)] = 10.0
+    alone_s: Annotated[float, Range(0.1, 600.0)] = 2.0
     velocity_jump: Annotated[float, Range(0.1, 100.0)] = 2.0
     bias_sigmas: Annotated[float, Range(1.0, 100.0)] = 6.0
 
