@@ -4,23 +4,34 @@ from __future__ import annotations
 
 import hashlib
 import io
+import subprocess
+import sys
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
+import laspy
 import numpy as np
 import pytest
+import rasterio
 
 from air.config import AirConfig
+from air.conversion.convert import convert
 from air.info import summarize
+from air.sensors.h264 import image_of
 from air.simulate import record_flight, simulate
+from air.sources.known import read_known
 from air.sources.simulated.aircraft import READ_BYTES
+from air.sources.simulated.clocks import Device
 from air.sources.simulated.flown import SimulatedFlight
 from air.sources.simulated.imu import ImuOptions
 from air.sources.source import open_source
 from common.errors import ExportError, SourceError
+from common.export.projection import UtmProjection
 from common.export.trajectory import read_tum
 from common.measurements import (
+    CameraFrame,
     ClockState,
     GnssEpoch,
     ImuSample,
@@ -31,6 +42,7 @@ from common.measurements import (
     VehicleState,
 )
 from common.recording.reader import Recording
+from common.se3 import rotation_angle
 from common.wire import encode
 
 SHORT = "sim:plain?duration=6&flight.start=air"
@@ -227,3 +239,98 @@ def test_the_receiver_finds_its_place() -> None:
     datum = source.aircraft.datum
     assert last.latitude_deg == pytest.approx(datum.latitude_deg, abs=1e-4)
     assert last.height == pytest.approx(datum.height, abs=15)
+
+
+# A long flight, and one with a camera
+
+MEMORY = """
+import os, sys
+from pathlib import Path
+from air.sources.source import open_source
+
+def resident_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
+
+early = None
+for heard in open_source(sys.argv[1]).heard():
+    if early is None and heard.t_s > float(sys.argv[2]):
+        early = resident_mb()
+    if heard.t_s > float(sys.argv[3]):
+        break
+print(early, resident_mb())
+"""
+
+
+def memory_mb(url: str, early_s: float, late_s: float) -> tuple[float, float]:
+    """Memory of a program that reads a flight, at two times of the flight."""
+    done = subprocess.run(
+        [sys.executable, "-c", MEMORY, url, str(early_s), str(late_s)], capture_output=True, text=True, check=True
+    )
+    early, late = map(float, done.stdout.split())
+    return early, late
+
+
+def test_half_an_hour_takes_no_more_memory_than_a_minute() -> None:
+    """What is drawn in advance for the whole flight is there from the start; the rest must not grow."""
+    early, late = memory_mb("sim:plain?duration=1800", 20.0, 90.0)
+    assert early < 400
+    assert late - early < 5  # 2 MB by which allocators breathe, and 1 kB for every second
+
+
+@pytest.mark.slow
+def test_half_an_hour_with_a_camera_stays_within_memory() -> None:
+    url = "sim:playground?duration=1800&camera.rate_hz=0.2"
+    early, late = memory_mb(url, 60.0, 1790.0)
+    assert early < 2500
+    assert late - early < 50
+
+
+@pytest.fixture(scope="module")
+def filmed() -> list[Measurement]:
+    return list(flight(FILMED))
+
+
+FILMED = (
+    "sim:playground?duration=7&flight.mission=hover&flight.height=12&flight.start=air&world.texel=0.1"
+    "&camera.rate_hz=6&camera.width=320&camera.height=180"
+)
+
+
+@pytest.mark.slow
+def test_frames_are_stamped_in_their_middle(filmed: list[Measurement]) -> None:
+    source = flight(FILMED)
+    clock, start_ns = source.aircraft.clocks[Device.CAMERA], source.aircraft.start_ns
+    taken = {f.index: float(clock.true_s(np.array(f.t_ns * 1e-9))) for _, f in source.aircraft.camera().frames()}
+    frames = of(CameraFrame, filmed)
+    assert len(frames) > 15
+    for frame in frames:
+        assert (frame.t_ns - start_ns) * 1e-9 == pytest.approx(taken[frame.index], abs=3e-3)  # the first seconds
+
+
+@pytest.mark.slow
+def test_a_filmed_flight_is_the_same_every_time_and_has_calibration_and_surface(
+    filmed: list[Measurement], tmp_path: Path
+) -> None:
+    simulate(AirConfig(), FILMED, tmp_path / "flight.mcap", tmp_path / "truth")
+    assert [encode(m) for m in open_source(str(tmp_path / "flight.mcap"))] == [encode(m) for m in filmed]
+    known, true = read_known(tmp_path / "flight.calibration"), flight(FILMED).aircraft
+    camera = known.cameras["down"]
+    assert camera.camera == true.nominal_lens
+    assert 0 < abs(camera.camera.fx - true.lens.fx) < 2
+    assert 0 < rotation_angle(camera.T_body_cam.R.T @ true.extrinsics.T_body_cam.R) < np.radians(1)
+    cloud = laspy.read(tmp_path / "truth" / "surface.laz")
+    p = UtmProjection(true.datum).to_world(np.asarray(cloud.xyz)[::1000])
+    assert np.median(np.abs(true.site.height(p[:, :2]) - p[:, 2])) < 0.005
+    with rasterio.open(tmp_path / "truth" / "dsm.tif") as dsm:
+        assert dsm.res == pytest.approx((0.125, 0.125), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_frames_come_back_from_a_euroc_folder(tmp_path: Path) -> None:
+    url = FILMED + "&camera.encoding=mono8"
+    convert(url, "euroc", tmp_path)
+    frames, back = of(CameraFrame, list(flight(url))), of(CameraFrame, list(open_source(f"euroc:{tmp_path}")))
+    assert len(frames) == len(back) > 15
+    for before, after in zip(frames, back, strict=True):
+        assert before.t_ns == after.t_ns
+        np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(after.data, np.uint8), -1), image_of(before))
