@@ -10,7 +10,7 @@ from air.sources.simulated.surface import CELL
 from common.arrays import F32, F64, U8
 
 _LUMPS = 256
-_LUMPY = 0.16
+_LUMPY = 0.11
 """Height of the lumps of a crown, of its radius."""
 BROADLEAF = [(74, 98, 46), (62, 86, 44), (88, 108, 52), (98, 102, 56), (54, 78, 46), (108, 112, 60)]
 CONIFER = [(42, 62, 42), (50, 70, 46), (36, 54, 40)]
@@ -24,7 +24,7 @@ class Plants:
         self.height: F32 = np.zeros(bounds.grid(CELL), np.float32)
         self.leaves: U8 = np.zeros((*self.height.shape, 3), np.uint8)
         self.leaves[:] = BROADLEAF[0]
-        self._lumps = periodic_detail(rng, _LUMPS, 3.0, 14.0)
+        self._lumps = periodic_detail(rng, _LUMPS, 4.5, 16.0)
 
     def grow(self, tree: Tree, conifer: bool = False) -> None:
         """Add a tree or bush: a lumpy dome, or a cone."""

@@ -37,6 +37,9 @@ _SMOOTH, _ROUGH, _EMPTY = 0, 1, 2
 _SMOOTH_SLOPE, _GRAZING = 0.4, 1.8
 _SKYWARD = -0.08
 """Rays that descend less, per metre of depth, see the sky."""
+_RASTER = -16 + GROUND
+_NEAR, _NEXT = 0.02, 1.01
+"""Rays whose depths differ by less than this share belong to one surface; how far a ray beside one other looks."""
 _UNIT = 1.0 / (LIGHT_SCALE * LIGHT_SCALE)
 _PER_CELL = 1.0 / CELL
 _FINEST = 0.05
@@ -82,7 +85,7 @@ def _start(
         if low >= ahead:
             t = ahead
             level = min(level + 1, LEVELS - 1)
-        elif level > 0 and (t * spread + pad) < 0.5 * size:
+        elif level > 0 and t * spread + pad < 0.5 * size:  # the level below still sees beyond the beam
             level -= 1
         else:
             return float(max(t, low))
@@ -164,13 +167,13 @@ def _fall(
 
 @compiled
 def _march(s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, begin: float) -> float:
-    """Where a ray meets the raster: lump by lump while it is above, then in steps of half a cell."""
+    """Where a ray meets the raster: lump by lump while it is above, then cell by cell."""
     rows, columns = s.lump_top.shape
     size = CELL * LUMP
     per_size, per_z = 1.0 / size, 1.0 / dz
     per_x = 1.0 / dx if dx != 0.0 else 1e30
     per_y = 1.0 / dy if dy != 0.0 else 1e30
-    step = 0.5 * CELL / max(math.hypot(dx, dy), 1e-6)
+    step = CELL / max(math.hypot(dx, dy), 1e-6)
     side_x, side_y = (1 if dx > 0.0 else 0), (1 if dy > 0.0 else 0)
     last = (oz - s.lowest) / -dz
     t = begin
@@ -204,7 +207,7 @@ def _between(
     f1: float,
 ) -> float:  # fmt: skip
     """Where a ray passes through the raster, above it at t0 and below at t1: regula falsi (Illinois)."""
-    t, enough = t1, 1e-5 * t1 + 1e-5
+    t, enough = t1, 3e-5 * t1 + 1e-5
     for _ in range(12):
         t = (t0 * f1 - t1 * f0) / (f1 - f0)
         f = oz + t * dz - raster_height(s, ox + t * dx, oy + t * dy)
@@ -218,20 +221,40 @@ def _between(
 
 
 @compiled
-def meet(
-    s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, begin: float, kind: int, found: I32,
-    count: int, guess: float, late: float, pace: F64,
+def _next_to(
+    s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, first: float, second: float
+) -> float:
+    """Where a ray between two others, which meet the raster at t `first` and `second`, meets it; −1: not near them."""
+    margin = 0.5 * abs(first - second) + 0.003 * first
+    t0, t1 = min(first, second) - margin, max(first, second) + margin
+    f0 = oz + t0 * dz - raster_height(s, ox + t0 * dx, oy + t0 * dy)
+    f1 = oz + t1 * dz - raster_height(s, ox + t1 * dx, oy + t1 * dy)
+    return _between(s, ox, oy, oz, dx, dy, dz, t0, t1, f0, f1) if f1 < 0.0 < f0 else -1.0
+
+
+@compiled
+def _on_raster(
+    s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, begin: float, kind: int, guess: float
+) -> float:
+    """Where a ray of a beam meets the raster, of which a height is guessed; −1 where it does not."""
+    if kind == _EMPTY or dz > _SKYWARD:
+        return -1.0
+    if kind == _SMOOTH:
+        return _fall(s, ox, oy, oz, dx, dy, dz, begin, guess)
+    return _march(s, ox, oy, oz, dx, dy, dz, begin)
+
+
+@compiled
+def _before(
+    s: Surface, t: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, found: I32, count: int,
+    late: float, pace: F64,
 ) -> tuple[float, int, int]:  # fmt: skip
-    """Where a ray of a beam meets the surface: parameter, solid (or −1, WATER, SKY) and face.
+    """What a ray that meets the raster at t (−1: not) meets first: parameter, solid (or −1, WATER, SKY) and face.
 
     Moving solids are `late` s further along their `pace` (K, 2) m/s than they stand.
     """
-    if kind == _EMPTY or dz > _SKYWARD:
+    if t < 0.0:
         return 1e4, SKY, GROUND
-    if kind == _SMOOTH:
-        t = _fall(s, ox, oy, oz, dx, dy, dz, begin, guess)
-    else:
-        t = _march(s, ox, oy, oz, dx, dy, dz, begin)
     solid, face = -1, GROUND
     if oz + t * dz < s.water:
         t, solid = (s.water - oz) / dz, WATER
@@ -474,14 +497,33 @@ def render(
             start, kind, count = look_ahead(s, p[im, 0], p[im, 1], p[im, 2], dx, dy, dz, spread, found)
             starts[n], blocks[n, 0], blocks[n, 1] = start, kind, count
             guess = p[im, 2] + start * dz
-            for i in range(i0, i1):
-                ox, oy, oz = p[i, 0], p[i, 1], p[i, 2]
-                late = row_s * (i - 0.5 * (height - 1))
-                for j in range(j0, j1):
-                    dx, dy, dz = _turned(R, i, rays[i, j, 0], rays[i, j, 1])
-                    t, solid, face = meet(s, ox, oy, oz, dx, dy, dz, start, kind, found, count, guess, late, pace)
-                    depth[i, j], what[i, j] = t, solid * 16 + face
-                    guess = oz + t * dz
+            # Every fourth row and column first; what is between two rays on the raster is found near them.
+            for sweep in range(5):
+                far, turn = (4, 2, 2, 1, 1)[sweep], (sweep + 1) % 2 if sweep else 0
+                begin_i, step_i = (i0 + far, 2 * far) if turn else (i0, 2 * far if sweep else 4)
+                begin_j, step_j = (j0, far) if turn or not sweep else (j0 + far, 2 * far)
+                for i in range(begin_i, i1, step_i):
+                    ox, oy, oz = p[i, 0], p[i, 1], p[i, 2]
+                    late = row_s * (i - 0.5 * (height - 1))
+                    for j in range(begin_j, j1, step_j):
+                        dx, dy, dz = _turned(R, i, rays[i, j, 0], rays[i, j, 1])
+                        t = -1.0
+                        if sweep:
+                            ia, ja = (i - far, j) if turn else (i, j - far)
+                            ib, jb = (i + far, j) if turn else (i, j + far)
+                            inner = ib < i1 and jb < j1
+                            first = depth[ia, ja]
+                            if what[ia, ja] == _RASTER and (not inner or what[ib, jb] == _RASTER):
+                                second = depth[ib, jb] if inner else _NEXT * first
+                                if kind == _ROUGH and abs(first - second) < _NEAR * first:
+                                    t = _next_to(s, ox, oy, oz, dx, dy, dz, first, second)
+                                elif kind == _SMOOTH and inner and far == 1:
+                                    t = 2.0 * first * second / (first + second)
+                        if t < 0.0:
+                            t = _on_raster(s, ox, oy, oz, dx, dy, dz, start, kind, guess)
+                        guess = oz + t * dz
+                        t, solid, face = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, late, pace)
+                        depth[i, j], what[i, j] = t, solid * 16 + face
     for i in range(height):
         ox, oy, oz = p[i, 0], p[i, 1], p[i, 2]
         late = row_s * (i - 0.5 * (height - 1))
@@ -505,9 +547,8 @@ def render(
                 for _ in range(4):
                     fu, fv = -fv, fu  # a turned square: four different rows and columns
                     dx, dy, dz = _turned(R, i, rays[i, j, 0] + fu, rays[i, j, 1] + fv)
-                    t, solid, face = meet(
-                        s, ox, oy, oz, dx, dy, dz, starts[n], kind, found, count, oz + depth[i, j] * dz, late, pace
-                    )
+                    t = _on_raster(s, ox, oy, oz, dx, dy, dz, starts[n], kind, oz + depth[i, j] * dz)
+                    t, solid, face = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, late, pace)
                     fine = math.log2(max(1.15 * t * pixel / s.texel, 1e-3))
                     r1, g1, b1 = _seen(
                         s, light, t, solid, face, ox, oy, oz, dx, dy, dz, pixel, fine, found, count, late, pace,
@@ -536,7 +577,7 @@ def raster_heights(s: Surface, xy: F64, z: F64) -> None:
 
 @compiled
 def _top(s: Surface, x: float, y: float) -> tuple[float, int]:
-    """Height of the surface and what forms it (as `meet` says)."""
+    """Height of the surface and what forms it (as `_before` says)."""
     best, solid = raster_height(s, x, y), -1
     if best < s.water:
         best, solid = s.water, WATER
@@ -584,7 +625,8 @@ def intersections(s: Surface, origin: F64, directions: F64, found: I32, p: F64, 
         length = math.sqrt(directions[n, 0] ** 2 + directions[n, 1] ** 2 + directions[n, 2] ** 2)
         dx, dy, dz = directions[n, 0] / length, directions[n, 1] / length, directions[n, 2] / length
         start, kind, count = look_ahead(s, ox, oy, oz, dx, dy, dz, 1e-4, found)
-        t, solid[n], _ = meet(s, ox, oy, oz, dx, dy, dz, start, kind, found, count, oz + start * dz, 0.0, pace)
+        t = _on_raster(s, ox, oy, oz, dx, dy, dz, start, kind, oz + start * dz)
+        t, solid[n], _ = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, 0.0, pace)
         p[n, 0], p[n, 1], p[n, 2] = ox + t * dx, oy + t * dy, oz + t * dz
 
 

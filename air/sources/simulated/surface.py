@@ -19,9 +19,9 @@ CELL = 0.125
 """Between nodes of the raster, m."""
 LUMP = 4
 """Cells of the raster along the side of a lump, whose highest point is known."""
-INDEX_CELL = 2.0
-LEVELS = 5
-"""Of the pyramid of highest points: cells of 2, 4, … 32 m."""
+INDEX_CELL = 1.0
+LEVELS = 6
+"""Of the pyramid of highest points: cells of 1, 2, … 32 m."""
 MIPS = 7
 """Of the texture: the coarsest texel is 64 times the finest."""
 LIGHT_SCALE = 255.0 / np.sqrt(1.5)
