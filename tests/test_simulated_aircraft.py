@@ -296,7 +296,6 @@ FILMED = (
 )
 
 
-@pytest.mark.slow
 def test_frames_are_stamped_in_their_middle(filmed: list[Measurement]) -> None:
     source = flight(FILMED)
     clock, start_ns = source.aircraft.clocks[Device.CAMERA], source.aircraft.start_ns
@@ -307,7 +306,6 @@ def test_frames_are_stamped_in_their_middle(filmed: list[Measurement]) -> None:
         assert (frame.t_ns - start_ns) * 1e-9 == pytest.approx(taken[frame.index], abs=3e-3)  # the first seconds
 
 
-@pytest.mark.slow
 def test_a_filmed_flight_is_the_same_every_time_and_has_calibration_and_surface(
     filmed: list[Measurement], tmp_path: Path
 ) -> None:

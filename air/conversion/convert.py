@@ -13,7 +13,7 @@ from tqdm import tqdm
 from air.conversion.calibrations import kalibr_cameras, kalibr_imu
 from air.conversion.euroc import EurocWriter
 from air.gnss.rinex_export import export_rinex
-from air.sources.known import ENDING, Known, read_known
+from air.sources.known import Known, read_known
 from air.sources.recorded import RecordedSource
 from air.sources.simulated.flight_truth import Row, pose_of, recorded_states
 from air.sources.simulated.flown import SimulatedFlight
@@ -97,12 +97,9 @@ def _sensed(
 
 
 def _known(source: Source) -> Known:
-    """What comes with a source: the simulator's own, that beside a recording, or cameras of a folder."""
-    if isinstance(source, SimulatedFlight):
-        return source.known
-    if isinstance(source, RecordedSource):
-        return read_known(source.path.with_suffix(ENDING))
-    return Known(getattr(source, "calibrations", {}))
+    """What comes with a source: all of a simulated or recorded flight, cameras alone of a folder."""
+    known: Known | None = getattr(source, "known", None)
+    return Known(getattr(source, "calibrations", {})) if known is None else known
 
 
 def _true_states(source: Source) -> Iterator[Row]:

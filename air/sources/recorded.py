@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 from air.sensors.h264 import H264Decoder
+from air.sources.known import ENDING, Known, read_known
 from air.sources.source import Problem, Sensed, Truth
 from common.errors import WireError
 from common.keys import parse_key
@@ -39,6 +40,11 @@ class RecordedSource:
     def path(self) -> Path:
         """The file."""
         return self._recording.path
+
+    @property
+    def known(self) -> Known:
+        """What was calibrated, from the folder beside the recording. Raises SourceError and ConfigError."""
+        return read_known(self.path.with_suffix(ENDING))
 
     @property
     def truth(self) -> Truth | None:
