@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 import rasterio
 
+from air.__main__ import main
 from air.config import AirConfig
 from air.conversion.convert import convert
 from air.info import summarize
 from air.sensors.h264 import image_of
 from air.simulate import record_flight, simulate
-from air.sources.known import read_known
+from air.sources.known import ENDING, read_known
 from air.sources.simulated.aircraft import READ_BYTES
 from air.sources.simulated.clocks import Device
 from air.sources.simulated.flown import SimulatedFlight
@@ -201,6 +202,29 @@ def test_no_reader_of_a_recording_comes_upon_the_truth(tmp_path: Path) -> None:
     assert (tables["truth/state"], tables["truth/clocks"]) == (6 * 200 + 1, 7)
     assert tables["truth/satellites"] > 6 * 30
     assert open_source(str(paths[True])).truth is None
+
+
+@pytest.mark.slow
+def test_no_estimator_finds_anything_else_without_the_truth(tmp_path: Path) -> None:
+    """Odometry and positions of a recording, and of the same one whose channels of truth were never written."""
+    url = (
+        "sim:playground?duration=16&flight.start=air&flight.height=12&flight.length=40&flight.width=12&world.texel=0.1"
+        "&camera.rate_hz=10&camera.width=480&camera.height=270"
+    )
+    found = []
+    for truth in (True, False):
+        folder = tmp_path / f"truth-{truth}"
+        folder.mkdir()
+        recording = folder / "flight.mcap"
+        with recording.open("wb") as file:
+            record_flight(flight(url), file, AirConfig(), truth)
+        flight(url).known.write(recording.with_suffix(ENDING))
+        assert main(["odometry", str(recording), "--out", str(folder / "odometry"), "--quiet"]) == 0
+        assert main(["position", str(recording), "--out", str(folder / "position.csv"), "--quiet"]) == 0
+        names = ("odometry/trajectory.tum", "odometry/keyframes.tum", "position.csv")
+        found.append([(folder / name).read_bytes() for name in names])
+    assert found[0] == found[1]
+    assert all(len(file) > 2000 for file in found[0])
 
 
 # Recordings
