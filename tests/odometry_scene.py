@@ -56,17 +56,24 @@ class Scene:
         """Samples and frames."""
         times = iter(np.arange(0.05, self.duration_s - 0.05, 1.0 / self.rate_hz).tolist())
         next_s, seen, next_id = next(times), {}, 0  # type: ignore[var-annotated]
+        for sample in self.samples():
+            while _ns(next_s) < sample.t_ns:
+                frame, seen, next_id = self._frame(next_s, seen, next_id)
+                yield frame
+                next_s = next(times, 1e6)
+            yield sample
+
+    def samples(self) -> Iterator[ImuSample]:
+        """The IMU samples alone."""
         for batch in self.device.batches():
             for t_s, accel, gyro, clipped in zip(batch.t_s, batch.accel, batch.gyro, batch.clipped, strict=True):
-                sample_s = t_s - self.imu.delay_s
-                while next_s < sample_s:
-                    frame, seen, next_id = self._frame(next_s, seen, next_id)
-                    yield frame
-                    next_s = next(times, np.inf)
-                yield ImuSample(_ns(sample_s), accel, gyro, saturated=bool(clipped.any()))
+                yield ImuSample(_ns(t_s - self.imu.delay_s), accel, gyro, saturated=bool(clipped.any()))
 
     def _frame(self, t_s: float, seen: dict[int, int], next_id: int) -> tuple[TrackedFrame, dict[int, int], int]:
-        uv = CAMERA.project(self.T_world_cam(t_s).inverse().apply(self.points))
+        T_world_cam = self.T_world_cam(t_s)
+        uv = np.full((len(self.points), 2), np.nan)
+        near = (np.abs(self.points[:, :2] - T_world_cam.t[:2]) < 20.0 + 1.2 * T_world_cam.t[2]).all(axis=1)
+        uv[near] = CAMERA.project(T_world_cam.inverse().apply(self.points[near]))
         visible = np.isfinite(uv).all(axis=1)
         visible &= (np.abs(uv - [CAMERA.cx, CAMERA.cy]) < [CAMERA.cx - 12, CAMERA.cy - 12]).all(axis=1)
         seen = {j: i for j, i in seen.items() if visible[j]}

@@ -91,6 +91,16 @@ class Estimator:
         self._propagation.advance(pieces)
         return self._propagation.state
 
+    def set_gravity(self, gravity: float) -> None:
+        """Use gravity m/s² as it is at this place; it stays once the estimate has begun.
+
+        In steady flight a hundredth of a m/s² weighs as much as all that tells the scale.
+        """
+        if self._propagation is None:
+            self._settings = replace(self._settings, imu=replace(self._settings.imu, gravity=gravity))
+            self._integrator = Preintegrator(self._settings.imu)
+            self._initialization.settings = self._settings
+
     def add_speed(self, speed: KnownSpeed) -> None:
         """Note how fast the aircraft moves: of use where it begins in flight."""
         if self._window is None:

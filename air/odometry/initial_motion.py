@@ -12,7 +12,7 @@ Estimator initialization in vision-aided inertial navigation with unknown camera
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import gtsam
@@ -68,14 +68,15 @@ def initial_in_motion(
     angle = parallax(frames[0], frames[-1], T_body_cam.R.T @ turned @ T_body_cam.R)
     if not angle > np.radians(settings.parallax_deg):
         return Refusal(f"the image has moved by {np.degrees(angle):.1f}° so far")
-    motion, sigma_v = _integrate(frames, buffer, gyro_bias, imu), LOOSE_VELOCITY
+    motion = _integrate(frames, buffer, gyro_bias, imu)
     seen = _seen(frames, motion, T_body_cam)
     if seen is None:
         return Refusal("too few points are seen long enough")
-    aligned = _align(seen, motion, T_body_cam, imu.gravity)
-    if aligned is not None and speed is not None and speed.speed > SIGNIFICANT * speed.sigma:
-        aligned, sigma_v = aligned.of_speed(speed), speed.sigma
-    elif aligned is None or not aligned.one_over_scale > SIGNIFICANT * aligned.sigma:
+    if speed is not None and speed.speed > SIGNIFICANT * speed.sigma:
+        aligned, sigma_v = _align(seen, motion, T_body_cam, imu.gravity, speed.speed), speed.sigma
+    else:
+        aligned, sigma_v = _align(seen, motion, T_body_cam, imu.gravity), LOOSE_VELOCITY
+    if aligned is None or not aligned.one_over_scale > SIGNIFICANT * aligned.sigma:
         return Refusal("there was too little acceleration to tell the scale")
     R_world_first = level(-aligned.down)
     gravity = imu.gravity * aligned.down
@@ -173,16 +174,14 @@ class _Aligned:
     one_over_scale: float
     sigma: float
 
-    def of_speed(self, known: KnownSpeed) -> _Aligned:
-        """The same with the scale that a speed asks for."""
-        factor = known.speed / max(float(np.linalg.norm(self.v_first)), 1e-9)
-        return replace(self, v_first=self.v_first * factor, one_over_scale=self.one_over_scale / factor)
 
-
-def _align(seen: _Seen, motion: _Motion, T_body_cam: SE3, gravity: float) -> _Aligned | None:
+def _align(
+    seen: _Seen, motion: _Motion, T_body_cam: SE3, gravity: float, speed: float | None = None
+) -> _Aligned | None:
     """Least squares of the distances of points from rays at a mean depth of one; None where it comes out behind.
 
-    Unknown are the first velocity, one over the scale k, and k times a change of `down` on its sphere.
+    Unknown are the first velocity, one over the scale k, and k times a change of `down` on its sphere. A known first
+    `speed` m/s tells k instead.
     """
     down = -motion.p[-1] / np.linalg.norm(motion.p[-1])
     projector = np.eye(3) - seen.direction[:, :, None] * seen.direction[:, None, :]
@@ -203,13 +202,15 @@ def _align(seen: _Seen, motion: _Motion, T_body_cam: SE3, gravity: float) -> _Al
         m = depths.mean(axis=0)
         free = np.linalg.solve(H, m)
         x = free / (m @ free)
-        k, turn = x[3], x[4:]
+        k, turn = x[3] if speed is None else np.linalg.norm(x[:3]) / speed, x[4:]
         along = depths @ x
         if k <= 0 or np.mean(along > 0) < IN_FRONT:
             return None
         down = down + turn @ tangent / k
         down /= np.linalg.norm(down)
         weight = 1.0 / np.clip(along, 0.2, 5.0) ** 2
+    if speed is not None:
+        return _Aligned(x[:3] / k, down, float(k), 0.0)
     variance = float(x @ H @ x) / (2 * len(weight) - 3 * seen.count)
     covariance = variance * (np.linalg.inv(H) - np.outer(free, free) / (m @ free))
     return _Aligned(x[:3] / k, down, float(k), float(np.sqrt(max(covariance[3, 3], 0.0))))

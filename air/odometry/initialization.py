@@ -19,7 +19,7 @@ class Initialization:
     """Collects frames and tries, after each, to begin at rest, and every few frames to begin in motion."""
 
     def __init__(self, focal: float, T_body_cam: SE3, buffer: ImuBuffer, settings: OdometrySettings) -> None:
-        self._focal, self._T_body_cam, self._buffer, self._settings = focal, T_body_cam, buffer, settings
+        self._focal, self._T_body_cam, self._buffer, self.settings = focal, T_body_cam, buffer, settings
         self._frames: list[TrackedFrame] = []
         self._speeds: list[KnownSpeed] = []
         self._tried_ns = 0
@@ -30,7 +30,7 @@ class Initialization:
 
     def feed(self, frame: TrackedFrame) -> Initial | Refusal:
         """States of this frame, or of several frames up to it; or why there are none yet."""
-        s = self._settings.initialization
+        s = self.settings.initialization
         begin_ns = frame.t_ns - round(max(s.span_s, s.still_s + 0.5) * 1e9)
         self._frames = [f for f in self._frames if f.t_ns >= begin_ns] + [frame]
         self._buffer.forget(self._frames[0].t_ns)
@@ -41,16 +41,16 @@ class Initialization:
         return self._in_motion(frame.t_ns)
 
     def _at_rest(self, t_ns: int) -> Initial | Refusal:
-        s = self._settings.initialization
+        s = self.settings.initialization
         begin_ns = t_ns - round(s.still_s * 1e9)
         frames = [f for f in self._frames if f.t_ns >= begin_ns]
         if self._frames[0].t_ns > begin_ns or not self._buffer.covers(begin_ns, t_ns):
             return Refusal("too little was seen so far")
         samples = self._buffer.samples(begin_ns, t_ns)
-        return initial_at_rest(samples, frames, self._focal, s, self._settings.imu)
+        return initial_at_rest(samples, frames, self._focal, s, self.settings.imu)
 
     def _in_motion(self, t_ns: int) -> Initial | Refusal:
-        s = self._settings.initialization
+        s = self.settings.initialization
         frames = [f for f in self._frames if len(f.ids) and self._buffer.covers(f.t_ns, t_ns)]
         if len(frames) < s.frames:
             return Refusal("too few frames were seen so far")
@@ -58,4 +58,4 @@ class Initialization:
         picked = [frames[i] for i in chosen]
         near = [v for v in self._speeds if abs(v.t_ns - picked[0].t_ns) < NEAR_NS]
         speed = min(near, key=lambda v: abs(v.t_ns - picked[0].t_ns)) if near else None
-        return initial_in_motion(picked, self._buffer, self._T_body_cam, self._focal, s, self._settings.imu, speed)
+        return initial_in_motion(picked, self._buffer, self._T_body_cam, self._focal, s, self.settings.imu, speed)

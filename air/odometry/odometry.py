@@ -15,7 +15,8 @@ from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import Tracker
 from air.sensors.calibration import Calibration
 from common.arrays import F64, U8
-from common.measurements import CameraFrame, Encoding, ImuSample, Measurement, ReceiverSolution
+from common.gravity import normal_gravity
+from common.measurements import CameraFrame, Encoding, FixKind, ImuSample, Measurement, ReceiverSolution
 from common.messages import EstimatorState, Keyframe, Mode, Photo, Pose
 
 Output = Pose | Keyframe | EstimatorState
@@ -63,10 +64,18 @@ class Odometry:
             state = self.estimator.add_imu(message)
             poses: list[Output] = [] if state is None else [self._pose(state)]
             return poses + self._frames()
-        if isinstance(message, ReceiverSolution) and np.isfinite([*message.v_enu, message.sigma_velocity]).all():
-            speed = float(np.linalg.norm(message.v_enu))
-            self.estimator.add_speed(KnownSpeed(message.t_ns, speed, max(message.sigma_velocity, MIN_SIGMA_SPEED)))
+        if isinstance(message, ReceiverSolution):
+            self._learn(message)
         return []
+
+    def _learn(self, solution: ReceiverSolution) -> None:
+        """What a receiver's own solution says about gravity and the speed: of use until it has begun."""
+        place = (solution.latitude_deg, solution.height)
+        if solution.kind is not FixKind.NONE and np.isfinite(place).all():
+            self.estimator.set_gravity(normal_gravity(*place))
+        if np.isfinite([*solution.v_enu, solution.sigma_velocity]).all():
+            speed = float(np.linalg.norm(solution.v_enu))
+            self.estimator.add_speed(KnownSpeed(solution.t_ns, speed, max(solution.sigma_velocity, MIN_SIGMA_SPEED)))
 
     def _frames(self) -> list[Output]:
         """What the waiting frames tell that IMU samples cover by now."""
