@@ -87,14 +87,14 @@ def _parser() -> argparse.ArgumentParser:
     replay.set_defaults(run=_replay)
 
     simulate = commands.add_parser("simulate", help="record a simulated flight as fast as it computes")
-    simulate.add_argument("source", metavar="URL", help="e.g. sim:plain?seed=1&duration=300&gnss.multipath=0")
+    simulate.add_argument("source", metavar="URL", help="e.g. sim:playground?seed=1&duration=300&gnss.multipath=0")
     simulate.add_argument("--out", type=Path, required=True, metavar="F.mcap", help="the recording")
     simulate.add_argument("--truth", type=Path, metavar="DIR", help="folder for the truth as files")
     simulate.add_argument("--quiet", action="store_true", help="no progress bar")
     simulate.set_defaults(run=_simulate)
 
     convert = commands.add_parser("convert", help="write a flight in the formats of other programs")
-    convert.add_argument("source", metavar="SOURCE", help="with IMU, camera or GNSS: F.mcap, sim:plain?seed=1, bag:F")
+    convert.add_argument("source", metavar="SOURCE", help="with IMU, camera or GNSS: F.mcap, sim:playground, bag:F")
     convert.add_argument("--to", required=True, metavar="euroc+rinex", help="formats: euroc, rinex, or both")
     convert.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     convert.add_argument("--calibration", type=Path, metavar="DIR", help="what simulate wrote beside its recording")

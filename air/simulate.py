@@ -33,7 +33,7 @@ def simulate(config: AirConfig, url: str, out: Path, truth: Path | None = None, 
     """
     flight = open_source(url)
     if not isinstance(flight, SimulatedFlight):
-        raise SourceError(f"source {url!r} is no simulated flight; use sim:plain?duration=60 or the like")
+        raise SourceError(f"source {url!r} is no simulated flight; use sim:playground?duration=60 or the like")
     try:
         with out.open("xb") as file:
             count = record_flight(flight, file, config, quiet=quiet)

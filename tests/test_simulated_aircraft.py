@@ -83,7 +83,7 @@ def test_the_order_of_options_does_not_matter() -> None:
 @pytest.mark.parametrize(
     ("url", "said"),
     [
-        ("sim:race", "there is no site 'race'; there are survey, plain, playground"),
+        ("sim:race", "there is no site 'race'; there are survey, plain, geotiff, playground"),
         ("sim:plain?gnss.multipaht=0", "gnss.multipaht is not a setting; did you mean multipath?"),
         ("sim:plain?gnss.multipath=-1", "gnss.multipath is -1.0; allowed: 0.0 to 1000.0"),
         ("sim:plain?gnss.multipath=much", "gnss.multipath is 'much'; allowed: a number"),
@@ -91,6 +91,7 @@ def test_the_order_of_options_does_not_matter() -> None:
         ("sim:plain?gnss.outage=9-3", "option 'outage' is '9-3', must be seconds of the flight"),
         ("sim:plain?gnss.systems=X", "option 'systems' is 'X', must be some of GREC"),
         ("sim:plain?colour=red", "colour is not a setting"),
+        ("sim:plain?ortho=a.tif", "ortho is not a setting"),
         ("sim:plain?duration=0", "duration is 0.0; allowed: 1.0 to 7200.0"),
         ("sim:plain?seed=1.5", "seed is 1.5; allowed: a whole number"),
         ("sim:plain?seed=1&seed=2", "option 'seed' is given twice"),
@@ -345,6 +346,28 @@ def test_a_filmed_flight_is_the_same_every_time_and_has_calibration_and_surface(
     assert np.median(np.abs(true.site.height(p[:, :2]) - p[:, 2])) < 0.005
     with rasterio.open(tmp_path / "truth" / "dsm.tif") as dsm:
         assert dsm.res == pytest.approx((0.125, 0.125), rel=1e-3)
+
+
+def test_a_flight_takes_place_over_files_of_a_real_place(tmp_path: Path) -> None:
+    """100 m × 100 m in UTM zone 50: a plane that rises by 1 m in 20 m to the east, 37.5 m high in its middle."""
+    grid = {"crs": "EPSG:32650", "transform": rasterio.Affine(0.5, 0.0, 247_000, 0.0, -0.5, 3_380_100)}
+    height = np.tile(35 + (np.arange(200) + 0.5) / 40, (200, 1)).astype(np.float32)
+    colour = np.random.default_rng(1).integers(60, 200, (3, 200, 200), np.uint8)
+    for name, bands in (("ortho", colour), ("dsm", height[None])):
+        shape = {"count": len(bands), "height": 200, "width": 200, "dtype": bands.dtype}
+        with rasterio.open(tmp_path / f"{name}.tif", "w", driver="GTiff", **shape, **grid) as raster:
+            raster.write(bands)
+    files, small = f"ortho={tmp_path}/ortho.tif&dsm={tmp_path}/dsm.tif", "camera.width=64&camera.height=48"
+    source = flight(
+        f"sim:geotiff?{files}&duration=2&flight.mission=stand&camera.rate_hz=2&camera.width=64&camera.height=48"
+    )
+    assert source.aircraft.datum.latitude_deg == pytest.approx(30.528, abs=0.01)
+    assert source.aircraft.datum.height == pytest.approx(37.5, abs=0.1)
+    slope = source.aircraft.ground.height(np.array([[-20.0, 0.0], [20.0, 0.0]]))
+    assert slope[1] - slope[0] == pytest.approx(2.0, abs=0.05)
+    assert {m.device for m in of(RawBytes, list(source))} == {"imu", "gnss", "base", "mavlink"}
+    with pytest.raises(SourceError, match=r"ortho=nothing\.tif cannot be read"):
+        open_source(f"sim:geotiff?ortho=nothing.tif&dsm={tmp_path}/dsm.tif")
 
 
 @pytest.mark.slow

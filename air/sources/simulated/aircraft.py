@@ -46,19 +46,12 @@ BASE_MAST = 2.0
 IMU_HEIGHT = 0.25
 """Where the base station stands, from home, and how high its antenna and the standing aircraft's IMU are, m."""
 
-_LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT = 30.5355, 114.3655, 62.0
-
 CAMERA = "down"
 """Name of the camera."""
 
 
 class _Sender(Protocol):
     def packets(self) -> Iterator[tuple[float, bytes]]: ...
-
-
-def datum_of(seed: int) -> Datum:
-    """The datum of a flight at a site that lies nowhere in particular."""
-    return Datum(f"2024-06-01T09-00-00-sim{seed}", _LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 from air.sensors.driver import Driver, TimeScale
 from air.sources.known import Known
-from air.sources.simulated.aircraft import Aircraft, Arrival, datum_of
+from air.sources.simulated.aircraft import Aircraft, Arrival
 from air.sources.simulated.flight_truth import FlightTruth
 from air.sources.simulated.ground import SITES, open_ground
 from air.sources.simulated.known import known_of
@@ -132,6 +132,6 @@ def open_flight(url: str, rest: str) -> SimulatedFlight:
         raise SourceError(f"source {url!r}: there is no site {name!r}; there are survey, {', '.join(SITES)}")
     options = parse_options(url, name, query)
     try:
-        return SimulatedFlight(url, Aircraft(options, open_ground(options, name), datum_of(options.seed)))
+        return SimulatedFlight(url, Aircraft(options, *open_ground(options, name)))
     except (ConfigError, SourceError) as error:
         raise SourceError(f"source {url!r}: {error}") from error

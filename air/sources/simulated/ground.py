@@ -6,14 +6,17 @@ from typing import Protocol
 
 import numpy as np
 
+from air.sources.simulated.geotiff import read_site
 from air.sources.simulated.layout import Bounds
 from air.sources.simulated.mission import plan
-from air.sources.simulated.options import PLAIN, SimulationOptions
+from air.sources.simulated.options import GEOTIFF, PLAIN, SimulationOptions
 from air.sources.simulated.sites import SITES as WORLDS
 from air.sources.simulated.sites import generate_site
 from common.arrays import F64, Bool
+from common.messages import Datum
 
-SITES = (PLAIN, *WORLDS)
+SITES = (PLAIN, GEOTIFF, *WORLDS)
+_LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT = 30.5355, 114.3655, 62.0
 _MARGIN, _REACH = 25.0, 1.25
 """How far beyond its way an aircraft sees, m, and for each metre that it is high."""
 _CELL = 2.0
@@ -43,9 +46,16 @@ class Plain:
         return np.asarray(directions[:, 2] < 0)
 
 
-def open_ground(options: SimulationOptions, site: str) -> Ground:
-    """The ground of a site, as far as the flight and its camera reach. A world takes some seconds to be made."""
-    return Plain() if site == PLAIN else generate_site(options.world, options.seed, reach_of(options))
+def open_ground(options: SimulationOptions, site: str) -> tuple[Ground, Datum]:
+    """The ground of a site, and the datum there. A world takes some seconds to be made, as large as the flight needs.
+
+    Raises SourceError for files of an orthophoto and a surface model that cannot be used.
+    """
+    flight = f"2024-06-01T09-00-00-sim{options.seed}"
+    if site == GEOTIFF:
+        return read_site(options.geotiff, options.seed, flight)
+    ground = Plain() if site == PLAIN else generate_site(options.world, options.seed, reach_of(options))
+    return ground, Datum(flight, _LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT)
 
 
 def reach_of(options: SimulationOptions) -> Bounds:

@@ -9,6 +9,7 @@ from urllib.parse import parse_qsl
 
 from air.sources.simulated.clocks import ClockOptions
 from air.sources.simulated.extrinsics import ExtrinsicsOptions
+from air.sources.simulated.geotiff import GeotiffOptions
 from air.sources.simulated.gnss_options import GnssOptions
 from air.sources.simulated.imu import ImuOptions
 from air.sources.simulated.mission import FlightOptions
@@ -20,6 +21,9 @@ from common.errors import ConfigError, SourceError
 
 PLAIN = "plain"
 """The site with nothing on it to see, whose camera stays at home."""
+GEOTIFF = "geotiff"
+"""The site of files that the options name: `sim:geotiff?ortho=FILE&dsm=FILE`."""
+_FILES = "ortho", "dsm"
 PERFECT, OFF = "perfect", "off"
 DEVICES = ("imu", "gnss", "base", "mavlink", "camera")
 """What can be left at home: `base=off`."""
@@ -32,6 +36,7 @@ class SimulationOptions:
     seed: Annotated[int, Range(0, 2**31 - 1)] = 1
     duration: Annotated[float, Range(1.0, 7200.0)] = 300.0
     world: WorldOptions = field(default_factory=WorldOptions)
+    geotiff: GeotiffOptions = field(default_factory=GeotiffOptions)
     flight: FlightOptions = field(default_factory=FlightOptions)
     imu: ImuOptions = field(default_factory=ImuOptions)
     gnss: GnssOptions = field(default_factory=GnssOptions)
@@ -59,6 +64,8 @@ def parse_options(url: str, site: str, query: str) -> SimulationOptions:
         given[key] = text
     if site == PLAIN:
         given.setdefault("camera", OFF)
+    elif site == GEOTIFF:
+        given |= {f"{GEOTIFF}.{name}": given.pop(name) for name in _FILES if name in given}
     else:
         given["world.site"] = site
     try:
