@@ -51,6 +51,10 @@ class Signals:
         """Distances (M,) m that the signals travel to a place (3,) m, the turn of the earth included."""
         return geometric_range(self.p_satellite, p_ecef)[0]
 
+    def sigma_rate(self, epoch: GnssEpoch) -> F64:
+        """One sigma (M,) m/s of the rates as the receiver of their epoch says, 0 where it does not."""
+        return np.nan_to_num(epoch.sigma_doppler[self.row] * LIGHT / self.frequency)
+
 
 def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
     """The signals of healthy satellites above the horizon with what models know taken off, for a receiver near a place.

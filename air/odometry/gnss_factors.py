@@ -1,0 +1,197 @@
+"""The GNSS epochs after one keyframe as one linear factor on that keyframe and on the biases of the satellites.
+
+Where the antenna is at an epoch follows from the keyframe by the inertial measurements between them, so that epochs
+need not coincide with frames. Ranges are linear in the antenna's position to a millimetre over some hundred metres,
+and everything else here is linear, so one linearisation serves. The receiver's clock and its drift are free at each
+epoch and are eliminated at once. Sources: Cao, Lu, Shen, GVINS (2022), section V; Groves, Principles of GNSS, Inertial
+and Multisensor Integrated Navigation Systems, 14.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from air.gnss.gnss_time import SECOND_NS
+from air.gnss.orbit import EARTH_RATE, geometric_range
+from air.gnss.signals import LIGHT
+from air.odometry.gnss_biases import REFERENCE_SYSTEMS, BiasNode, Kind
+from air.odometry.gnss_preprocessing import CleanEpoch
+from common.arrays import F64, I64
+from common.se3 import SE3, skew
+
+POSE, VELOCITY, BIAS = slice(0, 6), slice(6, 9), slice(9, 15)
+STATES = 15
+"""Columns of a keyframe: gtsam's tangent of its pose (rotation, translation, both in body), velocity, IMU biases."""
+
+
+@dataclass(frozen=True, eq=False)
+class AntennaMotion:
+    """The antenna `p_world` (3,) m and `v_world` (3,) m/s, and how they change with the keyframe: (3, 15) each."""
+
+    p_world: F64
+    v_world: F64
+    p_by_state: F64
+    v_by_state: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Rows of one or more epochs, as ½ (f − 2 gᵀδ + δᵀ G δ) of a keyframe's 15 columns and a node's D columns.
+
+    `rows` were used; `chi_square` is what they left of their own noise before they were weighted down.
+    """
+
+    G: F64
+    g: F64
+    f: float
+    rows: int
+    chi_square: float
+
+
+def antenna_motion(
+    pose: gtsam.Pose3,
+    velocity: F64,
+    bias: gtsam.imuBias.ConstantBias,
+    measured: gtsam.PreintegratedCombinedMeasurements,
+    p_body_antenna: F64,
+    omega_body: F64,
+) -> AntennaMotion:
+    """The antenna at the end of pre-integrated measurements that begin at a keyframe.
+
+    `omega_body` (3,) rad/s is the rate of turn at the end, measured, of which the bias is still to be taken.
+    """
+    by_state, by_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
+    nav = measured.predict(gtsam.NavState(pose, velocity), bias, by_state, by_bias)
+    R_keyframe, R = pose.rotation().matrix(), nav.pose().rotation().matrix()
+    # gtsam's tangent of a NavState holds position and velocity in body axes.
+    by_state[:, 6:] = by_state[:, 6:] @ R_keyframe.T
+    by = np.hstack([by_state, by_bias])
+    omega = omega_body - bias.gyroscope()
+    swing = np.cross(omega, p_body_antenna)
+    p_by_state = R @ (by[3:6] - skew(p_body_antenna) @ by[:3])
+    v_by_state = R @ (by[6:] - skew(swing) @ by[:3])
+    v_by_state[:, 12:15] += R @ skew(p_body_antenna)
+    return AntennaMotion(
+        nav.pose().translation() + R @ p_body_antenna, nav.velocity() + R @ swing, p_by_state, v_by_state
+    )
+
+
+def linearise(
+    epoch: CleanEpoch, motion: AntennaMotion, node: BiasNode, u: F64, T_ecef_world: SE3, robust: float
+) -> Linearised:
+    """The code, carrier and Doppler of an epoch as a factor, linear at `motion` and at the biases `u` (D,) of a node.
+
+    Rows beyond `robust` sigmas lose weight: infinite for biases that were not adjusted yet, which explain residuals of
+    metres. Rows whose biases the node does not have are left out.
+    """
+    p = T_ecef_world.apply(motion.p_world)
+    v = T_ecef_world.R @ motion.v_world
+    distance, line = geometric_range(epoch.p_satellite, p)
+    line_world = line @ T_ecef_world.R
+    width = STATES + len(node)
+    by_position = np.zeros((len(line), width))
+    by_position[:, :STATES] = -line_world @ motion.p_by_state
+    by_velocity = np.zeros((len(line), width))
+    by_velocity[:, :STATES] = -line_world @ motion.v_by_state
+    systems = _columns(node, Kind.SYSTEM, epoch.systems)
+    multipath, slow = (_columns(node, kind, epoch.satellites) for kind in (Kind.MULTIPATH, Kind.SLOW))
+    ambiguity = _columns(node, Kind.AMBIGUITY, epoch.arcs)
+    drift = _columns(node, Kind.DRIFT, [arc or name for arc, name in zip(epoch.arcs, epoch.satellites, strict=True)])
+    systems_known = (systems >= 0) | np.isin(epoch.systems, REFERENCE_SYSTEMS)
+
+    code = np.flatnonzero(np.isfinite(epoch.code) & (multipath >= 0) & (slow >= 0) & systems_known)
+    carrier = np.flatnonzero(np.isfinite(epoch.carrier) & (ambiguity >= 0) & (drift >= 0))
+    rate = np.flatnonzero(np.isfinite(epoch.rate) & (drift >= 0) & ~np.isfinite(epoch.carrier))
+    values, since_s = np.concatenate([np.zeros(STATES), u]), (epoch.t_ns - node.t_ns) / SECOND_NS
+
+    def rows(which: I64, H: F64, measured: F64, expected: F64, *columns: tuple[I64, float]) -> tuple[F64, F64]:
+        H = H[which].copy()
+        for column, factor in columns:
+            found = column[which] >= 0
+            H[np.flatnonzero(found), STATES + column[which][found]] = factor
+        return H, measured[which] - expected[which] - H[:, STATES:] @ values[STATES:]
+
+    H_code, r_code = rows(code, by_position, epoch.code, distance, (multipath, 1.0), (slow, 1.0), (systems, 1.0))
+    H_carrier, r_carrier = rows(carrier, by_position, epoch.carrier, distance, (ambiguity, 1.0), (drift, since_s))
+    H_rate, r_rate = rows(rate, by_velocity, epoch.rate, _range_rates(epoch, p, v, line), (drift, 1.0))
+    ranging = _eliminated(
+        np.vstack([H_code, H_carrier]),
+        np.concatenate([r_code, r_carrier]),
+        np.concatenate([epoch.sigma_code[code], epoch.sigma_carrier[carrier]]),
+        robust,
+    )
+    return total([ranging, _eliminated(H_rate, r_rate, epoch.sigma_rate[rate], robust)])
+
+
+def total(parts: Sequence[Linearised]) -> Linearised:
+    """The sum of factors on the same keyframe and node, at least one."""
+    return Linearised(
+        G=np.sum([part.G for part in parts], axis=0),
+        g=np.sum([part.g for part in parts], axis=0),
+        f=sum(part.f for part in parts),
+        rows=sum(part.rows for part in parts),
+        chi_square=sum(part.chi_square for part in parts),
+    )
+
+
+def as_factor(linear: Linearised, keys: Sequence[int], values: gtsam.Values) -> gtsam.LinearContainerFactor:
+    """The factor on the keys of pose, velocity, IMU biases and node (if it has one), linear at `values`."""
+    G, g = linear.G, linear.g[:, None]
+    X, V, B, N = POSE, VELOCITY, BIAS, slice(STATES, len(g))
+    if len(keys) == 3:
+        whole = gtsam.HessianFactor(
+            *keys, G[X, X], G[X, V], G[X, B], g[X], G[V, V], G[V, B], g[V], G[B, B], g[B], linear.f
+        )
+        return gtsam.LinearContainerFactor(whole, values)
+    x, v, b, n = keys
+    none, size = np.zeros((6, 1)), len(g) - STATES
+    zero_v, zero_n = np.zeros((3, 3)), np.zeros((size, size))
+    # gtsam takes up to three keys at once in Python: the sum of these is the whole.
+    parts = gtsam.GaussianFactorGraph()
+    parts.push_back(
+        gtsam.HessianFactor(x, v, n, G[X, X], G[X, V], G[X, N], g[X], G[V, V], G[V, N], g[V], G[N, N], g[N], linear.f)
+    )
+    parts.push_back(gtsam.HessianFactor(x, b, np.zeros((6, 6)), G[X, B], none, G[B, B], g[B], 0.0))
+    parts.push_back(
+        gtsam.HessianFactor(
+            v, b, n, zero_v, G[V, B], np.zeros((3, size)), np.zeros((3, 1)),
+            np.zeros((6, 6)), G[B, N], none, zero_n, np.zeros((size, 1)), 0.0,
+        )
+    )  # fmt: skip
+    return gtsam.LinearContainerFactor(gtsam.HessianFactor(parts), values)
+
+
+def _columns(node: BiasNode, kind: Kind, names: Sequence[str]) -> I64:
+    """Column of each bias in the node, −1 where it has none."""
+    return np.array([node.biases.get((kind, name), -1) for name in names], np.int64)
+
+
+def _range_rates(epoch: CleanEpoch, p: F64, v: F64, line: F64) -> F64:
+    """Geometric range rates (N,) m/s, the turn of the earth included."""
+    turn, p_sat, v_sat = EARTH_RATE / LIGHT, epoch.p_satellite, epoch.v_satellite
+    sagnac = turn * (v_sat[:, 0] * p[1] + p_sat[:, 0] * v[1] - v_sat[:, 1] * p[0] - p_sat[:, 1] * v[0])
+    return np.asarray(np.einsum("ij,ij->i", v_sat - v, line) + sagnac)
+
+
+def _eliminated(H: F64, r: F64, sigma: F64, robust: float) -> Linearised:
+    """Rows with one unknown that all share, their clock, which is eliminated."""
+    width = H.shape[1]
+    if len(r) < 2:
+        return Linearised(np.zeros((width, width)), np.zeros(width), 0.0, 0, 0.0)
+    off = r - _weighted_median(r, 1 / sigma**2)
+    scaled = np.abs(off) / sigma
+    weight = np.minimum(1.0, robust / np.maximum(scaled, 1e-9)) / sigma**2
+    mean_H, mean_r = weight @ H / weight.sum(), weight @ r / weight.sum()
+    H, r = H - mean_H, r - mean_r
+    WH = weight[:, None] * H
+    return Linearised(H.T @ WH, WH.T @ r, float(weight @ r**2), len(r), float(np.sum(scaled**2)))
+
+
+def _weighted_median(values: F64, weight: F64) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(below, below[-1] / 2)])

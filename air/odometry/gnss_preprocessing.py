@@ -1,0 +1,256 @@
+"""From the raw measurements of an epoch to those that the odometry can believe.
+
+Elevation mask, satellites seen for a while, C/N0 and standard-deviation gates, residual tests, and both bands as one:
+the mean of their codes and Dopplers, and the carrier free of the ionosphere where both are locked. Source: Wang et al.
+(seed of this project), 3.3; Misra and Enge, Global Positioning System, 5.7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from air.gnss.ephemerides import Ephemerides
+from air.gnss.gnss_time import SECOND_NS
+from air.gnss.positioning import PointPosition, Refused, find_position
+from air.gnss.settings import PositioningSettings
+from air.odometry.gnss_base import BaseStation, Differences
+from air.odometry.gnss_carrier import CarrierLocks
+from air.odometry.gnss_corrections import Signals, correct
+from air.odometry.gnss_settings import GnssSettings
+from common.arrays import F64, I64, Bool
+from common.measurements import GnssEpoch
+
+_LOW = np.radians(20.0)
+_NOMINAL_CN0 = 45.0
+_GLONASS = 1.5
+_MIN_GLONASS_ORBIT = 3.0
+_LEAST = 0.7
+_MIN_DIFFERENCES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class CleanEpoch:
+    """One row for each of N satellites at GPST `t_ns`, the receiver's clock taken off.
+
+    `systems` (N,) names the clock of each, with "-base" when differences to a base station are taken; `p_satellite`,
+    `v_satellite` (N, 3) are in ECEF at transmission. What models know is taken off `code`, `carrier` m and `rate` m/s
+    (N,), all of which may be NaN. `arcs` (N,) names the unbroken carrier, empty where there is none. White noise is
+    `sigma_code`, `sigma_carrier`, `sigma_rate` (N,); what stays for a while is `sigma_multipath` and `sigma_slow` (N,)
+    m of the code, and `sigma_drift` (N,) m/s of Doppler and carrier. `fix` is the single-point position of the epoch,
+    None where it had none.
+    """
+
+    t_ns: int
+    satellites: tuple[str, ...]
+    systems: tuple[str, ...]
+    p_satellite: F64
+    v_satellite: F64
+    code: F64
+    carrier: F64
+    rate: F64
+    arcs: tuple[str, ...]
+    sigma_code: F64
+    sigma_carrier: F64
+    sigma_rate: F64
+    sigma_multipath: F64
+    sigma_slow: F64
+    sigma_drift: F64
+    elevation: F64
+    fix: PointPosition | None
+
+
+class GnssPreprocessor:
+    """Cleans the epochs of one receiver; keeps ephemerides, locks and its clock whatever happens elsewhere."""
+
+    def __init__(self, settings: GnssSettings, base: F64 | None = None) -> None:
+        """`base` (3,) m, ECEF, is where a base station stands whose epochs come by `add_base`."""
+        self._settings = settings
+        selection = settings.selection
+        self.broadcast = Ephemerides()
+        self._point = PositioningSettings(
+            elevation_mask_deg=selection.elevation_mask_deg, min_cn0=selection.min_cn0, exclude_outliers=True
+        )
+        self._locks = CarrierLocks(selection)
+        self._base = None if base is None else BaseStation(base, selection)
+        self._seen: dict[str, tuple[int, int]] = {}
+        self._codes: dict[str, tuple[int, float, float]] = {}
+        self._fix: PointPosition | None = None
+
+    def add(self, message: object) -> None:
+        """Keep what satellites broadcast; ignore anything else."""
+        self.broadcast.add(message)
+
+    def add_base(self, epoch: GnssEpoch) -> None:
+        """Take an epoch of the base station."""
+        if self._base is not None:
+            signals = correct(epoch, self.broadcast, self._base.p_ecef)
+            self._base.add(epoch.t_ns / SECOND_NS, signals, epoch.lock_s[signals.row])
+
+    def clean(self, epoch: GnssEpoch, near: F64 | None = None) -> CleanEpoch | Refused:
+        """The believable rows of an epoch, or why there are none.
+
+        `near` (3,) m, ECEF, is where the antenna is about; without it the epoch needs a position of its own.
+        """
+        outcome = find_position(epoch, self.broadcast, self._point, near)
+        fix = outcome if isinstance(outcome, PointPosition) else None
+        clock_s = self._clock(epoch, fix)
+        if clock_s is None or (fix is None and near is None):
+            return outcome if isinstance(outcome, Refused) else Refused(epoch.t_ns, "clock unknown", {})
+        t_ns = epoch.t_ns - round(clock_s * SECOND_NS)
+        place = fix.position if fix is not None else near
+        assert place is not None
+        signals = correct(epoch, self.broadcast, place)
+        usable = self._usable(epoch, signals, t_ns)
+        rejected = {name for name, why in outcome.rejected.items() if why.startswith("residual")}
+        if fix is not None:
+            usable &= ~np.isin(signals.satellites, list(rejected))
+        arcs = self._locks.step(epoch.t_ns / SECOND_NS, signals, epoch.lock_s[signals.row])
+        if not self._settings.selection.carrier:
+            arcs[:] = -1
+        clean = self._combine(epoch, signals, usable, arcs, t_ns, fix)
+        return self._without_jumps(clean)
+
+    def _clock(self, epoch: GnssEpoch, fix: PointPosition | None) -> float | None:
+        """How far the receiver's clock is ahead, s: by this epoch's own fix, or by the last one's and its drift."""
+        if fix is not None:
+            self._fix = fix
+            return next(iter(fix.clocks.values()))
+        last = self._fix
+        if last is None or epoch.clock_reset or epoch.t_ns - last.t_ns > self._settings.max_age_s * SECOND_NS:
+            return None
+        drift = last.drift if np.isfinite(last.drift) else 0.0
+        return next(iter(last.clocks.values())) + drift * (epoch.t_ns - last.t_ns) / SECOND_NS
+
+    def _usable(self, epoch: GnssEpoch, signals: Signals, t_ns: int) -> Bool:
+        """Which signals (M,) pass the gates that look at one signal alone."""
+        s, row = self._settings.selection, signals.row
+        for satellite in set(signals.satellites):
+            since, last = self._seen.get(satellite, (t_ns, t_ns))
+            self._seen[satellite] = (since if t_ns - last < 3 * SECOND_NS else t_ns, t_ns)
+        seen_s = np.array([(t_ns - self._seen[satellite][0]) / SECOND_NS for satellite in signals.satellites])
+        good = signals.elevation >= np.radians(s.elevation_mask_deg)
+        good &= ~(epoch.cn0[row] < s.min_cn0)
+        good &= (np.fmax(seen_s, epoch.lock_s[row]) >= s.min_seen_s) if len(row) else good
+        good &= ~(epoch.sigma_pseudorange[row] > s.max_sigma_code)
+        return np.asarray(good)
+
+    def _combine(
+        self, epoch: GnssEpoch, signals: Signals, usable: Bool, arcs: I64, t_ns: int, fix: PointPosition | None
+    ) -> CleanEpoch:
+        """The bands of each satellite as one row."""
+        s, noise = self._settings.selection, self._settings.noise
+        known_rate = signals.sigma_rate(epoch) <= s.max_sigma_rate
+        signals = replace(signals, rate=np.where(known_rate, signals.rate, np.nan))
+        measured = _Measured(signals, arcs, _loudness(epoch.cn0[signals.row]))
+        if self._base is not None:
+            measured, usable = measured.minus(self._base.differences(epoch.t_ns / SECOND_NS, signals), usable)
+        second = {name: i for i, name in enumerate(signals.satellites) if not signals.first[i] and usable[i]}
+        first = [i for i in range(len(signals.satellites)) if signals.first[i] and usable[i]]
+        rows = [measured.of(i, second.get(signals.satellites[i])) for i in first]
+        code, carrier, rate, sigma, sigma_carrier, bend, own = np.array([row[:7] for row in rows]).reshape(-1, 7).T
+        elevation = signals.elevation[first]
+        systems = tuple(signals.clocks[i] + ("-base" if measured.differential else "") for i in first)
+        glonass = np.array([name[0] == "R" for name in systems], bool)
+        orbit = np.where(glonass, max(noise.orbit, _MIN_GLONASS_ORBIT), noise.orbit)
+        air = np.hypot(noise.ionosphere * bend * signals.slant[first], noise.troposphere / np.sin(elevation))
+        left = noise.differential if measured.differential else 1.0
+        return CleanEpoch(
+            t_ns=t_ns,
+            satellites=tuple(signals.satellites[i] for i in first),
+            systems=systems,
+            p_satellite=signals.p_satellite[first],
+            v_satellite=signals.v_satellite[first],
+            code=code,
+            carrier=carrier,
+            rate=rate,
+            arcs=tuple(row[7] for row in rows),
+            sigma_code=noise.code * sigma * np.where(glonass, _GLONASS, 1.0),
+            sigma_carrier=noise.carrier * sigma_carrier,
+            sigma_rate=noise.rate * sigma,
+            sigma_multipath=noise.multipath * (0.5 + 1.5 * np.exp(-elevation / _LOW)) * _share(second, signals, first),
+            sigma_slow=np.hypot(orbit, air) * left,
+            sigma_drift=np.hypot(noise.orbit_drift, noise.drift * signals.slant[first] * bend * own) * left,
+            elevation=elevation,
+            fix=fix,
+        )
+
+    def _without_jumps(self, clean: CleanEpoch) -> CleanEpoch:
+        """Without the codes that moved since the last epoch otherwise than their Doppler says."""
+        n = len(clean.satellites)
+        moved = np.full(n, np.nan)
+        for i, name in enumerate(clean.satellites):
+            t_ns, code, rate = self._codes.get(name, (0, np.nan, np.nan))
+            dt = (clean.t_ns - t_ns) / SECOND_NS
+            if dt < 3.0 and np.isfinite(clean.rate[i]):
+                moved[i] = clean.code[i] - code - (clean.rate[i] + rate) / 2 * dt
+            self._codes[name] = clean.t_ns, float(clean.code[i]), float(clean.rate[i])
+        known = np.isfinite(moved)
+        moved -= np.median(moved[known]) if known.any() else 0.0
+        wild = np.abs(moved) > self._settings.selection.max_jump
+        return replace(clean, code=np.where(wild, np.nan, clean.code))
+
+
+_Row = tuple[float, float, float, float, float, float, float, str]
+"""Code, carrier m, rate m/s; sigmas of code and carrier in units of their own; bend of the ionosphere in the code; 1
+where the ionosphere is in the carrier; the carrier's arc."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Signals with their arcs (M,) and how loud they are: sigma (M,) in units of that at 45 dBHz."""
+
+    signals: Signals
+    arcs: I64
+    sigma: F64
+    differential: bool = False
+    base_arcs: I64 | None = None
+
+    def minus(self, base: Differences, usable: Bool) -> tuple[_Measured, Bool]:
+        """Differences to a base station, where it saw the same signals; all as they are when it saw too few of them."""
+        both = usable & np.isfinite(base.code)
+        if np.sum(both & self.signals.first) < _MIN_DIFFERENCES:
+            return self, usable
+        signals = replace(self.signals, code=self.signals.code - base.code, carrier=self.signals.carrier - base.carrier)
+        arcs = np.where(base.arc >= 0, self.arcs, -1)
+        return _Measured(signals, arcs, self.sigma, True, base.arc), both
+
+    def of(self, i: int, j: int | None) -> _Row:
+        """The signal `i` of the first band and, where there is one, `j` of the second as one row."""
+        s, name = self.signals, self.signals.satellites[i]
+        bands = [i] if j is None else [i, j]
+        loud = self.sigma[bands]
+        shared = float(s.code[bands].mean()), float(s.rate[bands].mean()), float(np.hypot.reduce(loud)) / len(bands)
+        code, rate, sigma = shared
+        bend = float(s.bend[bands].mean())
+        if self.arcs[i] < 0:
+            return code, np.nan, rate, sigma, np.nan, bend, 1.0, ""
+        if self.base_arcs is not None:
+            arc = f"{name}/{self.arcs[i]}-{self.base_arcs[i]}"
+            return code, float(s.carrier[i]), rate, sigma, float(loud[0]), bend, 0.0, arc
+        if j is None or self.arcs[j] < 0:
+            return code, float(s.carrier[i]), rate, sigma, float(loud[0]), bend, 1.0, f"{name}/{self.arcs[i]}"
+        f1, f2 = s.frequency[bands] ** 2
+        a, b = f1 / (f1 - f2), -f2 / (f1 - f2)
+        free = float(a * s.carrier[i] + b * s.carrier[j])
+        return (
+            code,
+            free,
+            rate,
+            sigma,
+            float(np.hypot(*(a, b) * loud)),
+            bend,
+            0.0,
+            f"{name}/{self.arcs[i]}+{self.arcs[j]}",
+        )
+
+
+def _loudness(cn0: F64) -> F64:
+    """Sigma (M,) of white noise in units of that at 45 dBHz."""
+    return np.maximum(10 ** ((_NOMINAL_CN0 - np.where(np.isnan(cn0), _NOMINAL_CN0, cn0)) / 20), _LEAST)
+
+
+def _share(second: dict[str, int], signals: Signals, first: list[int]) -> F64:
+    """What is left (N,) of multipath where codes of two bands are averaged."""
+    return np.array([np.sqrt(0.5) if signals.satellites[i] in second else 1.0 for i in first])
