@@ -137,6 +137,14 @@ def test_a_device_that_is_off_says_nothing() -> None:
     assert {m.device for m in of(RawBytes, measurements)} == {"gnss"}
 
 
+def test_without_a_receiver_the_computer_s_clock_stands_in() -> None:
+    """It was right when the flight began, and tells itself five times a second: 20 times are enough."""
+    source = flight("sim:plain?duration=5&gnss=off&clock.drift_ppm=0")
+    samples = of(ImuSample, list(source))
+    assert len(samples) > 200
+    assert 0 <= samples[-1].t_ns - source.aircraft.start_ns <= 5.02e9
+
+
 def test_stamps_are_true_to_a_millisecond_from_jittery_arrivals() -> None:
     """The longest path from the antenna to the host depends on how many signals an epoch holds: 0.3 ms for each."""
     source = flight("sim:plain?duration=40&gnss.missing=0")
@@ -358,9 +366,7 @@ def test_a_flight_takes_place_over_files_of_a_real_place(tmp_path: Path) -> None
         with rasterio.open(tmp_path / f"{name}.tif", "w", driver="GTiff", **shape, **grid) as raster:
             raster.write(bands)
     files, small = f"ortho={tmp_path}/ortho.tif&dsm={tmp_path}/dsm.tif", "camera.width=64&camera.height=48"
-    source = flight(
-        f"sim:geotiff?{files}&duration=2&flight.mission=stand&camera.rate_hz=2&camera.width=64&camera.height=48"
-    )
+    source = flight(f"sim:geotiff?{files}&duration=2&flight.mission=stand&camera.rate_hz=2&{small}")
     assert source.aircraft.datum.latitude_deg == pytest.approx(30.528, abs=0.01)
     assert source.aircraft.datum.height == pytest.approx(37.5, abs=0.1)
     slope = source.aircraft.ground.height(np.array([[-20.0, 0.0], [20.0, 0.0]]))

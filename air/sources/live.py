@@ -132,7 +132,7 @@ class Live:
     def _tell_time_of_day(self, now_ns: int) -> None:
         if self._host_tells and now_ns - self._host_told_ns > HOST_TELLS_S * 1e9:
             self._host_told_ns = now_ns
-            told = _time_only(self._clock.now_ns())
+            told = time_only(self._clock.now_ns())
             self._timebase.restamp(told, "host", TimeScale.GNSS, time.monotonic_ns())
 
 
@@ -166,7 +166,8 @@ def _ports(devices: DevicesConfig) -> Iterator[tuple[Driver, PortConfig]]:
         yield MavlinkVehicle("mavlink"), devices.mavlink
 
 
-def _time_only(t_ns: int) -> ReceiverSolution:
+def time_only(t_ns: int) -> ReceiverSolution:
+    """What a computer tells that stands in for a receiver: GPST ns, and nothing else."""
     nan = float("nan")
     unknown = np.full(3, nan)
     return ReceiverSolution(t_ns, "host", FixKind.TIME_ONLY, nan, nan, nan, nan, nan, unknown, nan, nan, 0)

@@ -33,7 +33,8 @@ from common.se3 import SE3, matrix_to_quaternion
 TRUTH = "truth"
 """What stands before the names of the tables in a recording."""
 RATE_HZ = 200
-CLOUD_SPACING = 0.1
+CLOUD_SPACING, CLOUD_POINTS = 0.1, 5e6
+"""Between points of the true surface, m, as long as there are not more of them than this."""
 STATE, CLOCKS, SATELLITES = "state", "clocks", "satellites"
 _STEP_NS = 1_000_000_000 // RATE_HZ
 _SECOND_NS = 1_000_000_000
@@ -153,8 +154,10 @@ def write_rows(folder: Path, rows: Iterable[Row]) -> None:
 
 
 def write_surface(folder: Path, site: Site, datum: Datum) -> None:
-    """Write surface.laz, points every 0.1 m with their colours, and dsm.tif; what moves is left out."""
-    strips = list(site.cloud(CLOUD_SPACING))
+    """Write surface.laz, points with their colours, and dsm.tif, 0.125 m; what moves is left out."""
+    bounds = site.bounds
+    area = (bounds.east - bounds.west) * (bounds.north - bounds.south)
+    strips = list(site.cloud(max(CLOUD_SPACING, float(np.sqrt(area / CLOUD_POINTS)))))
     p_world, colour = (np.concatenate([strip[i] for strip in strips]) for i in range(2))
     write_points(folder / "surface.laz", p_world, colour.astype(np.uint8), datum)
     height = site.dsm()

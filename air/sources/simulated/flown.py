@@ -8,6 +8,7 @@ from functools import cached_property
 
 from air.sensors.driver import Driver, TimeScale
 from air.sources.known import Known
+from air.sources.live import HOST_TELLS_S, time_only
 from air.sources.simulated.aircraft import Aircraft, Arrival
 from air.sources.simulated.flight_truth import FlightTruth
 from air.sources.simulated.ground import SITES, open_ground
@@ -18,7 +19,7 @@ from air.timing import Timebase
 from common.errors import ConfigError, SourceError
 from common.measurements import CameraFrame, Measurement, RawBytes
 
-BASE = "base"
+GNSS, BASE = "gnss", "base"
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +97,12 @@ class _Host:
         self._drivers, self._timebase = drivers, timebase
         self._aircraft = aircraft
         self._switched_on_ns = aircraft.start_ns - aircraft.host_ns(0.0)
+        self._told_ns = 0
 
     def take(self, arrival: Arrival) -> Heard:
         """What an arrival tells."""
         host_ns, device, data = self._aircraft.host_ns(arrival.t_s), arrival.device, arrival.data
+        self._tell_time_of_day(host_ns)
         if isinstance(data, CameraFrame):
             told = self._stamped([data], device, TimeScale.DEVICE, host_ns)
             return Heard(arrival.t_s, device, len(data.data), 1, 0, [data], told)
@@ -118,6 +121,12 @@ class _Host:
             return list(found)
         stamped = [self._timebase.restamp(measurement, device, scale, host_ns) for measurement in found]
         return [*(known for known in stamped if known is not None), *self._timebase.states(host_ns)]
+
+    def _tell_time_of_day(self, host_ns: int) -> None:
+        """Let the computer's clock stand in for a receiver that is not there."""
+        if GNSS not in self._drivers and host_ns - self._told_ns > HOST_TELLS_S * 1e9:
+            self._told_ns = host_ns
+            self._timebase.restamp(time_only(self._switched_on_ns + host_ns), "host", TimeScale.GNSS, host_ns)
 
     def _time_of_day_ns(self, host_ns: int) -> int:
         """GNSS time; as long as it is unknown, that of the computer's clock, which was set at the start."""
