@@ -48,7 +48,9 @@ def fiducial_site(blobs: np.ndarray, relief: float = 1.0, boxes: tuple[Box, ...]
     """Dark, rolling ground with a bright spot, a Gaussian of BLOB m, at each of (N, 2) m."""
     rng = np.random.default_rng(3)
     coarse = fractal(rng, BOUNDS.grid(CELL), CELL, ((40.0, relief), (12.0, 0.2 * relief)))
-    solids = solid_table([box_solid(b, 0.0, (250, 250, 250), (250, 250, 250), (PLAIN, PLAIN), k) for k, b in enumerate(boxes)])
+    solids = solid_table(
+        [box_solid(b, 0.0, (250, 250, 250), (250, 250, 250), (PLAIN, PLAIN), k) for k, b in enumerate(boxes)]
+    )
     surface = build_surface(
         BOUNDS, np.ascontiguousarray(coarse), solids, solid_table([]), TEXEL, daylight(), -np.inf,
         np.zeros(coarse.shape, np.uint8), periodic_textures(rng),

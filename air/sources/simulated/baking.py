@@ -14,12 +14,11 @@ from air.sources.simulated.surface import (
     DETAIL_TEXELS,
     LIGHT_SCALE,
     PATTERN_MIPS,
-    PATTERN_TEXEL,
     PATTERN_TEXELS,
     Surface,
     texture_level,
 )
-from common.arrays import F32, F64, U8, I32
+from common.arrays import F32, F64, I32, U8
 
 _SKY_SCALES = ((1.0, 0.35), (4.0, 0.30), (12.0, 0.20))
 """How far around, m, ground that is higher hides the sky, and how much of it at a slope of one."""
@@ -50,7 +49,10 @@ def fill_levels(surface: Surface) -> None:
 def illumination(surface: Surface, light: Light) -> tuple[F32, F32]:
     """What share (h, w) of sun and sky light the raster of a surface gets."""
     z = surface.height
-    east, north = cv2.Sobel(z, cv2.CV_32F, 1, 0, scale=1 / (8 * CELL)), cv2.Sobel(z, cv2.CV_32F, 0, 1, scale=1 / (8 * CELL))
+    east, north = (
+        cv2.Sobel(z, cv2.CV_32F, 1, 0, scale=1 / (8 * CELL)),
+        cv2.Sobel(z, cv2.CV_32F, 0, 1, scale=1 / (8 * CELL)),
+    )
     up = 1 / np.sqrt(1 + east**2 + north**2)
     cosine = np.maximum((light.sun[2] - east * light.sun[0] - north * light.sun[1]) * up, 0)
     sun = cosine * np.clip((z + 0.12 - surface.shadow) * 4, 0, 1)
@@ -95,11 +97,21 @@ def _bake(
             high = w00 * plants[a, b] + w01 * plants[a, b + 1] + w10 * plants[a + 1, b] + w11 * plants[a + 1, b + 1]
             x, y = 0.79863551 * j + 0.60181502 * i, 0.79863551 * i - 0.60181502 * j
             noise = 0.7071 * (fine[0, i & n, j & n] + _noise(fine[1], 0.83 * x, 0.83 * y))
-            r, g, blue, strength = float(paint[i, j, 0]), float(paint[i, j, 1]), float(paint[i, j, 2]), float(paint[i, j, 3])
+            r, g, blue, strength = (
+                float(paint[i, j, 0]),
+                float(paint[i, j, 1]),
+                float(paint[i, j, 2]),
+                float(paint[i, j, 3]),
+            )
             if high > _LEAFY:
                 # The nearest colour that belongs to a plant.
                 a1, b1 = (a + 1 if fv > 0.5 else a), (b + 1 if fu > 0.5 else b)
-                r, g, blue, strength = float(leaves[a1, b1, 0]), float(leaves[a1, b1, 1]), float(leaves[a1, b1, 2]), 100.0
+                r, g, blue, strength = (
+                    float(leaves[a1, b1, 0]),
+                    float(leaves[a1, b1, 1]),
+                    float(leaves[a1, b1, 2]),
+                    100.0,
+                )
                 paint[i, j, 3] = 60
             gain = max(1.0 + strength / 255.0 * noise, 0.12) * scale / 255.0
             paint[i, j, 0] = min(r * gain * np.sqrt(light[0, 0] * direct + light[1, 0] * open_sky), 255.0)
@@ -125,15 +137,15 @@ def periodic_textures(rng: np.random.Generator) -> tuple[U8, U8]:
     """The patterns of solids and the finest detail, each level by level in one row; 128 is 1."""
     room = PATTERN_TEXELS * PATTERN_TEXELS * 4 // 3
     patterns = [_levels(pattern, PATTERN_MIPS, room) for pattern in _patterns(rng)]
-    detail = 128 + 38 * periodic_detail(rng, DETAIL_TEXELS, 2.5, 40.0)
+    detail = np.asarray(128 + 38 * periodic_detail(rng, DETAIL_TEXELS, 2.5, 40.0), np.float32)
     return np.concatenate(patterns), _levels(detail, DETAIL_MIPS, DETAIL_TEXELS * DETAIL_TEXELS * 4 // 3)
 
 
 def _levels(texture: F32, count: int, room: int) -> U8:
-    parts = []
+    parts: list[U8] = []
     for _ in range(count):
         parts.append(np.clip(np.rint(texture), 0, 255).astype(np.uint8).ravel())
-        texture = (texture[::2, ::2] + texture[1::2, ::2] + texture[::2, 1::2] + texture[1::2, 1::2]) / 4
+        texture = cv2.resize(texture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     row = np.concatenate(parts)
     return np.asarray(np.pad(row, (0, room - len(row))), np.uint8)
 

@@ -17,7 +17,9 @@ _SPACING_PX = 0.8
 
 
 @compiled
-def smear(light: F32, depth: F32, rays: F32, v_cam: F64, omega_cam: F64, focal: float, exposure_s: float, out: F32) -> None:
+def smear(
+    light: F32, depth: F32, rays: F32, v_cam: F64, omega_cam: F64, focal: float, exposure_s: float, out: F32
+) -> None:
     """Fill `out` (H, W, 3) with the mean of `light` (H, W, 3) along what each pixel passes in an exposure.
 
     `v_cam`, `omega_cam` (H, 3) m/s, rad/s of the camera in its own axes, row by row; `focal` px. Pixels outside the

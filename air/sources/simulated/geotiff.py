@@ -22,7 +22,7 @@ from air.sources.simulated.site import Site
 from air.sources.simulated.sites import texel_of
 from air.sources.simulated.solids import solid_table
 from air.sources.simulated.surface import CELL, LIGHT_SCALE, build_surface, texture_level
-from common.arrays import F32, F64, U8
+from common.arrays import F32, U8
 from common.config import Range
 from common.errors import SourceError
 from common.geo import enu_to_geodetic, geodetic_to_enu
@@ -32,6 +32,7 @@ _TEXTURES = 24
 _COARSE = 1.0
 """Projections are linear over this distance, m, to a micrometre."""
 _EARTH = 6.371e6
+"""Radius, m: by half the square of a distance over it, the ground falls below the plane of `world`."""
 _WHITE, _DETAIL = 0.95, 40
 _STRIP = 256
 
@@ -118,13 +119,8 @@ def _heights(dsm: DatasetReader, datum: Datum, bounds: Bounds) -> F32:
     filled[(filled == 0) & ~known] = np.median(values[known]) if known.any() else 0.0
     rows, columns = bounds.grid(CELL)
     height = _sampled(filled, _pixels(dsm, datum, bounds), CELL, 0, (rows, columns), cv2.INTER_LINEAR)
-    y, x = bounds.south + np.arange(rows)[:, None] * CELL, bounds.west + np.arange(columns) * CELL
-    return np.asarray(height - _bulge(x, y), np.float32)
-
-
-def _bulge(x: F64, y: F64) -> F64:
-    """How far the ellipsoid falls below the plane that touches it, m."""
-    return np.asarray((x * x + y * y) / (2 * _EARTH))
+    x, y = bounds.west + np.arange(columns) * CELL, bounds.south + np.arange(rows)[:, None] * CELL
+    return np.asarray(height - (x * x + y * y) / (2 * _EARTH), np.float32)
 
 
 def _paint(ortho: DatasetReader, datum: Datum, bounds: Bounds, texel: float, paint: U8) -> None:

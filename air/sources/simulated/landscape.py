@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field as default
+from dataclasses import dataclass
+from dataclasses import field as default
 from itertools import pairwise
 
 import cv2
@@ -24,8 +25,8 @@ _STRIP = 512
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """Bare ground (h, w) m and plants on the raster of a surface; paint (H, W, 4) uint8 of the ground, RGB (gamma 2) and
-    strength of detail; solids; `lanes` (N, 2) m for cars; height of the `water`, −inf without."""
+    """Bare ground (h, w) m and plants on the raster of a surface; paint (H, W, 4) uint8 of the ground, RGB (gamma 2)
+    and strength of detail; solids; `lanes` (N, 2) m for cars; height of the `water`, −inf without."""
 
     terrain: F32
     paint: U8
@@ -39,9 +40,7 @@ def town(rng: np.random.Generator, bounds: Bounds, texel: float, pond: float) ->
     """Houses along crossing roads, yards, containers, parked cars, gardens with trees."""
     terrain, water = ground(rng, bounds, ((110.0, 1.2), (45.0, 0.4), (16.0, 0.08)), pond)
     density = fractal(rng, bounds.grid(TERRAIN_CELL), TERRAIN_CELL, ((40.0, 0.8), (12.0, 0.6)))
-    layout = plan_village(
-        rng, bounds, np.asarray(0.05 + 0.6 * smoothstep(0.2, 1.6, density), np.float32), TERRAIN_CELL
-    )
+    layout = plan_village(rng, bounds, np.asarray(0.05 + 0.6 * smoothstep(0.2, 1.6, density), np.float32), TERRAIN_CELL)
     plants = Plants(rng, bounds)
     for tree in layout.trees:
         plants.grow(tree)
@@ -73,7 +72,8 @@ def field(rng: np.random.Generator, bounds: Bounds, texel: float, pond: float) -
         plants.grow(Tree(float(x), float(y), float(rng.uniform(0.8, 1.6)), float(rng.uniform(1.2, 2.8))))
         if rng.random() < 0.06:
             plants.grow(Tree(float(x), float(y), float(rng.uniform(2.5, 4.0)), float(rng.uniform(6, 10))))
-    shed = Box(*(float(c) for c in centre + 41.0 * across + 12.0 * along), turn, 5.0, 3.5, 3.2, 0.4)
+    x, y = (float(c) for c in centre + 41.0 * across + 12.0 * along)
+    shed = Box(x, y, turn, 5.0, 3.5, 3.2, 0.4)
     roof = ROOFS[int(rng.integers(len(ROOFS)))]
     solid = box_solid(shed, at(bounds, terrain, shed.x, shed.y), roof, (150, 128, 98), (TILES, PLASTER), 1)
     return Landscape(terrain, canvas.image, solid_table([solid]), plants, [track], water)
@@ -104,8 +104,8 @@ def forest(rng: np.random.Generator, bounds: Bounds, texel: float, pond: float) 
 def ground(
     rng: np.random.Generator, bounds: Bounds, relief: tuple[tuple[float, float], ...], pond: float
 ) -> tuple[F32, float]:
-    """Bare ground (h, w) m of octaves (wavelength m, standard deviation m) on a surface's raster, about 0 on average and
-    bilinear between nodes a metre apart; and the height of the water in a hollow, the radius of `pond` m."""
+    """Bare ground (h, w) m of octaves (wavelength m, standard deviation m) on a surface's raster, about 0 on average
+    and bilinear between nodes a metre apart; and the height of the water in a hollow, the radius of `pond` m."""
     coarse = fractal(rng, bounds.grid(TERRAIN_CELL), TERRAIN_CELL, relief)
     coarse -= coarse.mean()
     water, place = -np.inf, rng.uniform(-1, 1, 2)

@@ -12,7 +12,7 @@ from common.arrays import F32, F64, U8
 _LUMPS = 256
 _LUMPY = 0.11
 """Height of the lumps of a crown, of its radius."""
-BROADLEAF = [(74, 98, 46), (62, 86, 44), (88, 108, 52), (98, 102, 56), (54, 78, 46), (108, 112, 60)]
+BROADLEAF = [(74, 94, 48), (62, 84, 46), (82, 98, 52), (86, 94, 56), (56, 78, 48), (92, 100, 60)]
 CONIFER = [(42, 62, 42), (50, 70, 46), (36, 54, 40)]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,6 +16,9 @@ from air.sources.simulated.scene import CONCRETE, FACADE, PLAIN, PLASTER, RIBS
 from air.sources.simulated.solids import CARS, CONTAINERS, GLASS, Solid, box_solid, solid_table
 from common.arrays import F64
 
+Colour = tuple[int, int, int]
+Build = Callable[[Box, Colour, Colour, tuple[int, int]], None]
+"""Puts up a box with the colours and the patterns of its roof and its walls."""
 _STRAIGHT, _RADIUS, _LANE, _LANES = 84.39, 36.5, 1.22, 6
 """Of a standard track, m: the straight, the inner radius, the width of a lane."""
 _TRACK, _TRACK_WORN, _CHALK = (146, 82, 66, 34), (122, 92, 80, 40), (206, 202, 192, 22)
@@ -34,7 +39,7 @@ def playground(rng: np.random.Generator, bounds: Bounds, texel: float, pond: flo
     _paint_court(rng, canvas)
     solids: list[Solid] = []
 
-    def build(box: Box, roof: tuple[int, int, int], wall: tuple[int, int, int], patterns: tuple[int, int]) -> None:
+    def build(box: Box, roof: Colour, wall: Colour, patterns: tuple[int, int]) -> None:
         solids.append(box_solid(box, at(bounds, terrain, box.x, box.y), roof, wall, patterns, len(solids)))
 
     _build_stands(rng, build)
@@ -94,13 +99,19 @@ def _paint_track(rng: np.random.Generator, canvas: Canvas) -> None:
 
 def _paint_pitch(rng: np.random.Generator, canvas: Canvas) -> None:
     """The faded lines of a football pitch, and bare soil where players ran."""
-    for x, y, size in ((0, 46, 3.0), (0, -46, 3.0), (0, 0, 2.2), (12, 20, 1.6), (-9, -24, 1.8), (20, -5, 1.2)):
+    for east, north, size in ((0, 46, 3.0), (0, -46, 3.0), (0, 0, 2.2), (12, 20, 1.6), (-9, -24, 1.8), (20, -5, 1.2)):
         for _ in range(14):
-            spot = np.array([x, y]) + rng.normal(0, 0.6 * size, 2)
+            spot = np.array([east, north]) + rng.normal(0, 0.6 * size, 2)
             canvas.polygon(_blot(rng, spot, size * rng.uniform(0.15, 0.6)), tuple(int(c) for c in SOIL))
-    for a, b, y in ((30.0, 48.0, 0.0), (20.15, 8.25, 39.75), (20.15, 8.25, -39.75), (9.16, 2.75, 45.25), (9.16, 2.75, -45.25)):
+    for a, b, y in (
+        (30.0, 48.0, 0.0),
+        (20.15, 8.25, 39.75),
+        (20.15, 8.25, -39.75),
+        (9.16, 2.75, 45.25),
+        (9.16, 2.75, -45.25),
+    ):
         corners = np.array([[-a, -b], [a, -b], [a, b], [-a, b], [-a, -b]]) + [0.0, y]
-        for begin, end in zip(corners[:-1], corners[1:], strict=True):
+        for begin, end in pairwise(corners):
             s = np.linspace(0, 1, int(np.linalg.norm(end - begin) / 0.4) + 2)[:, None]
             _chalk(rng, canvas, begin + s * (end - begin), 0.11, 0.62)
     _chalk(rng, canvas, np.array([[x, 0.0] for x in np.arange(-30, 30.2, 0.4)]), 0.11, 0.62)
@@ -133,7 +144,7 @@ def _paint_court(rng: np.random.Generator, canvas: Canvas) -> None:
     _chalk(rng, canvas, [62.0, 22.0] + 1.8 * np.column_stack([np.cos(bend), np.sin(bend)]), 0.06, 0.8)
 
 
-def _build_stands(rng: np.random.Generator, build) -> None:  # type: ignore[no-untyped-def]
+def _build_stands(rng: np.random.Generator, build: Build) -> None:
     """Nine steps of concrete along the western straight, with what is left of their seats, and the wall behind."""
     for step in range(9):
         x = -_EDGE - 4.0 - 0.85 * step
@@ -142,7 +153,9 @@ def _build_stands(rng: np.random.Generator, build) -> None:  # type: ignore[no-u
                 continue
             colour = _SEATS[int(rng.integers(len(_SEATS)))]
             grey = (154, 151, 144)
-            build(Box(x, -28.0 + 8.0 * part, np.pi / 2, 3.6, 0.43, 0.5 + 0.42 * step), colour, grey, (CONCRETE, CONCRETE))
+            build(
+                Box(x, -28.0 + 8.0 * part, np.pi / 2, 3.6, 0.43, 0.5 + 0.42 * step), colour, grey, (CONCRETE, CONCRETE)
+            )
     for part in range(8):
         build(
             Box(-_EDGE - 12.2, -28.0 + 8.0 * part, np.pi / 2, 4.0, 0.18, 5.6), (168, 164, 156), (190, 182, 166),
@@ -150,7 +163,7 @@ def _build_stands(rng: np.random.Generator, build) -> None:  # type: ignore[no-u
         )  # fmt: skip
 
 
-def _build_houses(rng: np.random.Generator, build) -> None:  # type: ignore[no-untyped-def]
+def _build_houses(rng: np.random.Generator, build: Build) -> None:
     """Changing rooms, a shed, containers and parked cars."""
     build(Box(61.0, 62.0, 0.04, 9.0, 4.5, 4.2), (138, 134, 128), (206, 196, 172), (CONCRETE, FACADE))
     build(Box(66.5, 69.0, 0.04, 3.5, 3.0, 6.4), (150, 146, 140), (188, 180, 160), (CONCRETE, FACADE))
@@ -165,10 +178,12 @@ def _build_houses(rng: np.random.Generator, build) -> None:  # type: ignore[no-u
         build(Box(x, y - 0.25, turn, 1.15, 0.78, 1.45), colour, GLASS, (PLAIN, PLAIN))
     for x, y in ((62.0, 7.9), (62.0, 36.1)):
         build(Box(x, y, 0.0, 0.09, 0.09, 3.3), (120, 122, 126), (120, 122, 126), (PLAIN, PLAIN))
-        build(Box(x, y + (0.7 if y < 20 else -0.7), 0.0, 0.9, 0.06, 3.6), (214, 212, 206), (214, 212, 206), (PLAIN, PLAIN))
+        build(
+            Box(x, y + (0.7 if y < 20 else -0.7), 0.0, 0.9, 0.06, 3.6), (214, 212, 206), (214, 212, 206), (PLAIN, PLAIN)
+        )
 
 
-def _build_walls(rng: np.random.Generator, build) -> None:  # type: ignore[no-untyped-def]
+def _build_walls(rng: np.random.Generator, build: Build) -> None:
     """A wall around it all, with gaps where it fell."""
     for x, y, turn, length in (
         *((side * 76.0, y, np.pi / 2, 5.0) for side in (-1, 1) for y in np.arange(-95.0, 96.0, 10.0)),

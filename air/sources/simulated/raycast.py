@@ -1,7 +1,8 @@
 """Rays of a video camera against a `Surface`, and the light that they find, compiled.
 
-What is compiled together stands in one file, because numba's cache notices a changed file, not a changed callee. Rays are walked in beams of a block of pixels first: what a block can meet is found once (cf. Amanatides
-and Woo, A Fast Voxel Traversal Algorithm for Ray Tracing, 1987; Tevs et al., Maximum Mipmaps, 2008).
+What is compiled together stands in one file, because numba's cache notices a changed file, not a changed callee. Rays
+are walked in beams of a block of pixels first: what a block can meet is found once (cf. Amanatides and Woo, A Fast
+Voxel Traversal Algorithm for Ray Tracing, 1987; Tevs et al., Maximum Mipmaps, 2008).
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ _NEAR, _NEXT = 0.02, 1.01
 """Rays whose depths differ by less than this share belong to one surface; how far a ray beside one other looks."""
 _UNIT = 1.0 / (LIGHT_SCALE * LIGHT_SCALE)
 _PER_CELL = 1.0 / CELL
+_PER_LEAF = 50.0
 _FINEST = 0.05
 """Pixels of this width, m, no longer see the finest detail."""
 _LOW, _BLUE, _GREEN, _STRENGTH = np.uint64(0xFFFF), np.uint64(16), np.uint64(32), np.uint64(48)
@@ -133,9 +135,7 @@ def look_ahead(
 
 
 @compiled
-def _near(
-    s: Surface, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, spread: float
-) -> bool:
+def _near(s: Surface, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, spread: float) -> bool:
     """Whether a beam may touch a solid, or the ground that a moving one shades."""
     solid = s.solids[k]
     reach = math.hypot(solid.a, solid.b) + (5.0 if k >= s.still else 0.1)
@@ -152,7 +152,7 @@ def _near(
 def _fall(
     s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, begin: float, guess: float
 ) -> float:
-    """Where a ray meets a raster that is less steep than the ray, near a guessed height: a contraction along the ray."""
+    """Where a ray meets a raster less steep than the ray, near a guessed height: a contraction along the ray."""
     # The last pixel's height is a good guess; what is missed falls below a tenth of itself with each step.
     per_z = 1.0 / dz
     t = max((guess - oz) * per_z, begin)
@@ -189,7 +189,7 @@ def _march(s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz
         t = max(t, drop)
         before, above = t, oz + t * dz - raster_height(s, ox + t * dx, oy + t * dy)
         if above <= 0.0:
-            return t
+            return float(t)
         while t < out:
             t = min(t + step, out)
             height = oz + t * dz - raster_height(s, ox + t * dx, oy + t * dy)
@@ -332,6 +332,12 @@ def detail_gain(s: Surface, u: float, v: float, footprint: float, strength: floa
         return 1.0
     lod = math.log2(max(footprint / DETAIL_TEXEL, 1e-3))
     fine = _pyramid_texel(s.detail, 0, DETAIL_TEXELS, DETAIL_MIPS, u / DETAIL_TEXEL, v / DETAIL_TEXEL, lod)
+    if footprint < 0.5 * DETAIL_TEXEL:  # on the ground: the same once more, eleven times as fine
+        u, v = 11.3 * u, 11.3 * v
+        fine += 0.8 * _pyramid_texel(
+            s.detail, 0, DETAIL_TEXELS, DETAIL_MIPS, u / DETAIL_TEXEL, v / DETAIL_TEXEL, lod + 3.5
+        )
+        fine -= 0.8
     return max(1.0 + strength * (fine - 1.0), 0.1)
 
 
@@ -458,11 +464,19 @@ def _seen(
             hit, _ = enter_house(s.solids, k, px, py, oz + t * dz + 0.02, sun[0], sun[1], sun[2])
             if 0.0 < hit < 50.0:
                 shade = 0.3
-    if sway > 0.0:
-        h, w = s.sway.shape
-        i = int(min(max((y - s.south) * _PER_CELL, 0.0), h - 1.0))
-        j = int(min(max((x - s.west) * _PER_CELL, 0.0), w - 1.0))
-        size = sway * s.sway[i, j] / 255.0
+    h, w = s.sway.shape
+    leafy = s.sway[
+        int(min(max((y - s.south) * _PER_CELL, 0.0), h - 1.0)), int(min(max((x - s.west) * _PER_CELL, 0.0), w - 1.0))
+    ]
+    if leafy > 0:
+        z = oz + t * dz
+        # The texture is drawn out on the sides of crowns: leaves across them break it up.
+        leaf = _pyramid_texel(
+            s.detail, 0, DETAIL_TEXELS, DETAIL_MIPS, (x - 0.6 * y + 0.3 * z) * _PER_LEAF,
+            (0.9 * z + 0.4 * y) * _PER_LEAF, lod + 0.3,
+        )  # fmt: skip
+        shade *= min(max(0.3 + 0.7 * leaf, 0.1), 2.0)
+        size = sway * leafy / 255.0
         x += size * math.sin(2.1 * t_s + 0.5 * x + 0.3 * y)
         y += size * math.sin(1.7 * t_s + 0.4 * y - 0.2 * x + 1.0)
     r, g, b = raster_light(s, x, y, lod, footprint)
@@ -487,7 +501,7 @@ def render(
         i1 = min(i0 + block, height)
         for j0 in range(0, width, block):
             j1 = min(j0 + block, width)
-            im, jm = (i0 + i1) // 2, (j0 + j1) // 2
+            im = (i0 + i1) // 2
             n = i0 // block * across + j0 // block
             found = blocks[n, 2:]
             rx = 0.5 * (rays[i0, j0, 0] + rays[i1 - 1, j1 - 1, 0])

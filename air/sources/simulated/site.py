@@ -12,7 +12,7 @@ import numpy.typing as npt
 from air.sources.simulated import raycast
 from air.sources.simulated.layout import Bounds
 from air.sources.simulated.scene import Light
-from air.sources.simulated.surface import CELL, LIGHT_SCALE, Surface, rasterize, texture_level
+from air.sources.simulated.surface import LIGHT_SCALE, Surface, rasterize, texture_level
 from common.arrays import F32, F64, I32, U8, Bool
 
 _DSM_ROWS = 256
@@ -74,19 +74,23 @@ class Site:
         return z
 
     def intersect(self, origin: F64, directions: F64) -> tuple[F64, I32]:
-        """Where descending rays (N, 3) from an origin (3,) meet the surface: points (N, 3) m, and the solid of each (N,).
+        """Where descending rays (N, 3) from an origin (3,) meet the surface: points (N, 3) m, and solids (N,).
 
         −1 is ground or plants, −2 water, −3 the sky, whose points are far away.
         """
         rays = np.ascontiguousarray(directions, float)
         p, solid = np.empty_like(rays), np.empty(len(rays), np.int32)
-        raycast.intersections(self.still, np.asarray(origin, float), rays, np.empty(raycast.CANDIDATES, np.int32), p, solid)
+        raycast.intersections(
+            self.still, np.asarray(origin, float), rays, np.empty(raycast.CANDIDATES, np.int32), p, solid
+        )
         return p, solid
 
     def blocked(self, p_world: F64, directions: F64) -> Bool:
         """Whether the surface hides the sky in directions (N, 3) from a place (3,) m, both in world."""
         hidden = np.zeros(len(directions), np.bool_)
-        raycast.hidden(self.still, np.asarray(p_world, float) + [0, 0, _RAISED], np.ascontiguousarray(directions, float), hidden)
+        raycast.hidden(
+            self.still, np.asarray(p_world, float) + [0, 0, _RAISED], np.ascontiguousarray(directions, float), hidden
+        )
         return hidden
 
     def colour(self, xy: npt.ArrayLike) -> U8:
@@ -102,7 +106,7 @@ class Site:
         return np.asarray(np.maximum(top, np.float32(self.surface.water)), np.float32)
 
     def cloud(self, spacing: float = 0.1) -> Iterator[tuple[F64, U8]]:
-        """Points (N, 3) m in world on the surface as seen from above, and their colours (N, 3) uint8, strip by strip."""
+        """Points (N, 3) m in world on the surface, seen from above, and colours (N, 3) uint8, strip by strip."""
         x = np.arange(self.bounds.west + spacing / 2, self.bounds.east, spacing)
         y = np.arange(self.bounds.south + spacing / 2, self.bounds.north, spacing)
         for part in np.array_split(y, max(1, len(y) // _DSM_ROWS)):

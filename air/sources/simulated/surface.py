@@ -36,11 +36,11 @@ class Surface(NamedTuple):
 
     `height` (h, w) m every CELL; `lump_top` its highest point per lump. Per cell of INDEX_CELL, its eight neighbours
     included: `floor` and `steep` (rows, columns) are the lowest height and the steepest slope of the raster, and
-    `listed[first[c]:first[c + 1]]` the solids. `tops` holds the highest points of everything, level by level as `top_at`
-    (LEVELS, 3) says: begin, rows, columns. `colour` holds light that the raster sends out, RGB as LIGHT_SCALE says and
-    the strength of the finest detail, a byte each from the lowest on, level by level as `colour_at` (MIPS, 3) says, texels of `texel`
-    m at the finest. `shadow` (h, w) m: a point below it lies in the shade. `sway` (h, w) is 255 where plants move
-    fully. `pattern` and `detail` are periodic textures, level by level: 128 is 1.
+    `listed[first[c]:first[c + 1]]` the solids. `tops` holds the highest points of everything, level by level as
+    `top_at` (LEVELS, 3) says: begin, rows, columns. `colour` holds light that the raster sends out, RGB as LIGHT_SCALE
+    says and the strength of the finest detail, a byte each from the lowest on, level by level as `colour_at` (MIPS, 3)
+    says, texels of `texel` m at the finest. `shadow` (h, w) m: a point below it lies in the shade. `sway` (h, w) is 255
+    where plants move fully. `pattern` and `detail` are periodic textures, level by level: 128 is 1.
     """
 
     west: float
@@ -102,15 +102,18 @@ def build_surface(
     own_top = index_solids(solids, bounds, INDEX_CELL)[2].reshape(rows, columns).astype(np.float32)
     highest, lowest = _extremes(height, round(INDEX_CELL / CELL), (rows, columns))
     tops, top_at = _pyramid(np.maximum(np.maximum(highest, own_top), np.float32(water)))
-    slope = np.maximum(np.abs(np.diff(height, axis=0, append=height[-1:])), np.abs(np.diff(height, append=height[:, -1:])))
+    slope = np.maximum(
+        np.abs(np.diff(height, axis=0, append=height[-1:])), np.abs(np.diff(height, append=height[:, -1:]))
+    )
     steep = _extremes(np.asarray(slope / CELL, np.float32), round(INDEX_CELL / CELL), (rows, columns))[0]
     lumps = (-(-height.shape[0] // LUMP), -(-height.shape[1] // LUMP))
     colour, colour_at = empty_texture(bounds, texel)
     return Surface(
         bounds.west, bounds.south, height, _extremes(height, LUMP, lumps)[0],
         cv2.erode(lowest, np.ones((3, 3))), cv2.dilate(steep, np.ones((3, 3))), first, listed, tops, top_at,
-        np.concatenate([solids, moving]), colour, colour_at, texel, 1 / texel, _shadow(bounds, height, solids, light), sway,
-        *textures, water, float(tops.max()) + 0.01, float(height.min()), len(solids),
+        np.concatenate([solids, moving]), colour, colour_at, texel, 1 / texel,
+        _shadow(bounds, height, solids, light), sway, *textures, water, float(tops.max()) + 0.01,
+        float(height.min()), len(solids),
     )  # fmt: skip
 
 

@@ -184,7 +184,9 @@ class SimulatedCamera:
         exposure.learn(mean)
         if options.motion_blur:
             moving_s = options.motion_blur * exposure_s
-            film.smear(light, self._depth, self._rays, poses.v_cam, poses.omega_cam, self.model.fx, moving_s, self._smeared)
+            film.smear(
+                light, self._depth, self._rays, poses.v_cam, poses.omega_cam, self.model.fx, moving_s, self._smeared
+            )
             light = self._smeared
         if options.lens_blur:
             light = cv2.GaussianBlur(light, (3, 3) if options.lens_blur < 0.6 else (0, 0), options.lens_blur)
@@ -200,7 +202,7 @@ class SimulatedCamera:
     def poses(self, t_s: float) -> Poses:
         """Where the camera is while each row is exposed, the middle of the image at a true time s."""
         height = self.model.height
-        rows = t_s + self.line_time_s * (np.arange(height) - (height - 1) / 2)
+        rows = t_s + self.line_time_s * (np.arange(height, dtype=float) - (height - 1) / 2)
         motion, mount = self._trajectory.at(rows), self._T_body_cam
         R = motion.R_world_body @ mount.R
         v_body = np.einsum("nji,nj->ni", motion.R_world_body, motion.v_world) + np.cross(motion.omega_body, mount.t)
