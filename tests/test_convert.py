@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rtklib
 from recording_samples import frame as moving_picture
 
 from air.config import AirConfig
@@ -23,6 +24,7 @@ from air.sources.source import open_source
 from common.camera import CameraModel
 from common.errors import ConfigError, ExportError, SourceError
 from common.export.trajectory import read_tum
+from common.geo import T_ecef_enu
 from common.measurements import CameraFrame, Encoding, GlonassEphemeris, GnssEpoch, ImuSample, KeplerEphemeris
 from common.se3 import SE3
 
@@ -88,6 +90,21 @@ def test_the_truth_stands_beside_the_measurements_at_200_hz(converted: Path) -> 
     # Their columns are position, attitude, velocity, biases: the velocity is the derivative of the position.
     rate = np.gradient(table[:, 1:4], 1 / 200, axis=0)[1:-1]
     np.testing.assert_allclose(rate, table[1:-1, 8:11], atol=2e-4)
+
+
+def test_rtklib_fixes_the_exported_flight_where_its_antenna_was(tmp_path: Path) -> None:
+    """The phase of the rover against the base, carried by a body that leans and turns, to 3 cm of the truth."""
+    url = "sim:plain?duration=100&imu=off&mavlink=off"
+    convert(url, "rinex", tmp_path)
+    folder, aircraft = tmp_path / "rinex", open_source(url).aircraft
+    nav = folder / "broadcast.nav"
+    found = rtklib.kinematic(folder, folder / "gnss.obs", folder / "base.obs", nav, aircraft.p_base_ecef)
+    fixed = [solution for solution in found if solution.fixed]
+    assert len(fixed) > 0.4 * len(found) > 200
+    motion = aircraft.trajectory.at(np.array([s.t_ns - aircraft.start_ns for s in fixed]) * 1e-9)
+    antenna = motion.p_world + motion.R_world_body @ aircraft.extrinsics.p_body_antenna
+    told = T_ecef_enu(aircraft.datum).inverse().apply(np.array([s.position for s in fixed]))
+    assert np.linalg.norm(told - antenna, axis=1).max() < 0.03
 
 
 def test_a_recording_converts_like_the_flight_itself(converted: Path, tmp_path: Path) -> None:
