@@ -21,7 +21,9 @@ DETECTION_SCALE = 0.5
 """Corners are sought in a smaller image: a quarter of the work, and those found are less prone to blur."""
 MIN_CONTRAST = 2.0
 """Standard deviation of an image, gray levels, below which nothing is seen in it."""
-CONTRAST_TILES, CONTRAST_LIMIT = (8, 8), 3.0
+BRIGHTNESS, CONTRAST = 128.0, 50.0
+"""Mean and standard deviation, gray levels, that every image is given: so exposure and gain do not matter. Unlike an
+equalisation by tiles this is the same all over the image, and moves no point."""
 MAX_FROM_PREDICTION = 0.1
 """A point found further than this from where it was expected, in image widths, was mistaken."""
 
@@ -50,7 +52,6 @@ class Tracker:
     def __init__(self, camera: CameraModel, settings: TrackerSettings | None = None) -> None:
         self._camera = camera
         self._settings = settings or TrackerSettings()
-        self._equalise = cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES)
         self._last: U8 | None = None
         self._ids = np.zeros(0, np.int64)
         self._uv = np.zeros((0, 2), np.float32)
@@ -64,14 +65,15 @@ class Tracker:
         """
         if image.shape != (self._camera.height, self._camera.width):
             raise ValueError(f"image of {image.shape[1]} × {image.shape[0]} px for a camera of other size")
-        dull = bool(image.std() < MIN_CONTRAST)
-        equalised = self._equalise.apply(image)
+        mean, sigma = (float(value[0, 0]) for value in cv2.meanStdDev(image))
+        dull = sigma < MIN_CONTRAST
+        even = _with_contrast(image, mean, max(sigma, MIN_CONTRAST))
         if self._last is not None and len(self._ids):
-            self._follow(self._last, equalised, R_last_now)
-        self._last = equalised
+            self._follow(self._last, even, R_last_now)
+        self._last = even
         known = len(self._ids)
         if not dull:
-            self._detect(equalised)
+            self._detect(even)
         return self._frame(t_ns, line_time_s, known, dull)
 
     def forget(self, ids: I64) -> None:
@@ -159,3 +161,9 @@ class Tracker:
         self._uv = np.vstack([self._uv, uv])
         self._ids = np.concatenate([self._ids, self._next_id + np.arange(len(uv))])
         self._next_id += len(uv)
+
+
+def _with_contrast(image: U8, mean: float, sigma: float) -> U8:
+    """The image with the usual brightness and contrast."""
+    levels = BRIGHTNESS + (np.arange(256) - mean) * (CONTRAST / sigma)
+    return np.asarray(cv2.LUT(image, np.clip(levels, 0, 255).astype(np.uint8)), np.uint8)

@@ -297,7 +297,7 @@ class Window:
         limit = s.max_residual * s.pixel_sigma
         for v, i in outliers(views, points, self._focal, limit):
             self.frames[v].xy.pop(i)
-            self.frames[v].factors.pop(i)
+            self.frames[v].factors.pop(i, None)
         self._drop_lonely()
         return rms_px(views, {i: points[i] for i in self.points & points.keys()}, self._focal)
 
