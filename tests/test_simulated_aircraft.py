@@ -208,7 +208,7 @@ def test_no_reader_of_a_recording_comes_upon_the_truth(tmp_path: Path) -> None:
     read = [[encode(m) for m in open_source(str(path))] for path in paths.values()]
     assert read[0] == read[1] == [encode(m) for m in flight(SHORT)]
     tables = Counter(r.key for r in Recording(paths[True]).messages(encoding="json") if r.key.startswith("truth/"))
-    assert (tables["truth/state"], tables["truth/clocks"]) == (6 * 200 + 1, 7)
+    assert (tables["truth/flight"], tables["truth/state"], tables["truth/clocks"]) == (1, 6 * 200 + 1, 7)
     assert tables["truth/satellites"] > 6 * 30
     assert open_source(str(paths[True])).truth is None
 

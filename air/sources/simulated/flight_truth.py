@@ -35,7 +35,7 @@ TRUTH = "truth"
 RATE_HZ = 200
 CLOUD_SPACING, CLOUD_POINTS = 0.1, 5e6
 """Between points of the true surface, m, as long as there are not more of them than this."""
-STATE, CLOCKS, SATELLITES = "state", "clocks", "satellites"
+FLIGHT, STATE, CLOCKS, SATELLITES = "flight", "state", "clocks", "satellites"
 _STEP_NS = 1_000_000_000 // RATE_HZ
 _SECOND_NS = 1_000_000_000
 _VECTORS = ("p_world", "v_world", "a_world", "omega_body", "accel_bias", "gyro_bias")
@@ -57,12 +57,20 @@ class FlightTruth:
         self._aircraft = aircraft
 
     def rows(self) -> Iterator[Row]:
+        """What a recording holds: a row with the constants as JSON, then all tables."""
+        start_ns = self._aircraft.start_ns
+        yield Row(start_ns, FLIGHT, {"t_ns": start_ns, "json": json.dumps(self.constants())})
+        yield from self.tables()
+
+    def tables(self) -> Iterator[Row]:
         """All tables, merged in order of time."""
         return heapq.merge(self.states(), self.clocks(), self.satellites(), key=lambda row: row.t_ns)
 
     def states(self) -> Iterator[Row]:
-        """The body in world at 200 Hz: position, velocity, acceleration, attitude (q_world_body, w first), rates, and
-        the biases of the IMU."""
+        """The body in world at 200 Hz, and the biases of the IMU.
+
+        Position, velocity, acceleration and attitude (w first) in world; rates in body axes.
+        """
         aircraft = self._aircraft
         imu = aircraft.imu()
         last = int(aircraft.options.duration * RATE_HZ)
@@ -90,8 +98,11 @@ class FlightTruth:
             yield Row(t_ns, CLOCKS, values)
 
     def satellites(self) -> Iterator[Row]:
-        """Of the first epoch in each second every signal: where its satellite stands, °, its multipath, m, the whole
-        cycles in its phase, and how far the receiver's clock is ahead, s."""
+        """Every signal of the first epoch in each second.
+
+        Where its satellite stands, °, the multipath of its code, m, the whole cycles in its phase, and how far the
+        receiver's clock is ahead, s.
+        """
         aircraft = self._aircraft
         if "gnss" in aircraft.options.off:
             return
@@ -105,7 +116,7 @@ class FlightTruth:
                 yield Row(t_ns, SATELLITES, _signal(t_ns, observed, i))
 
     def constants(self) -> dict[str, object]:
-        """What stays the same through the flight: URL's options, extrinsics, matrices of the IMU, time offsets."""
+        """What stays the same through the flight: options, extrinsics, intrinsics, matrices of the IMU, offsets."""
         aircraft = self._aircraft
         options, imu = aircraft.options, aircraft.imu()
         return {
@@ -121,17 +132,17 @@ class FlightTruth:
         }
 
     def write(self, folder: Path) -> None:
-        """Write trajectory.tum (body in world), state.csv, clocks.csv, satellites.csv, flight.json and datum.json;
-        where there is something to see, its surface as surface.laz and dsm.tif.
+        """Write the truth as files into a folder, creating it.
 
-        Raises ExportError when a file cannot be written.
+        trajectory.tum (body in world), state.csv, clocks.csv, satellites.csv, flight.json, datum.json, and the surface
+        as surface.laz and dsm.tif where there is something to see. Raises ExportError when a file cannot be written.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_datum(folder / "datum.json", self._aircraft.datum)
             text = json.dumps(self.constants(), indent=2) + "\n"
             (folder / "flight.json").write_text(text, encoding="utf-8")
-            write_rows(folder, self.rows())
+            write_rows(folder, self.tables())
             if self._aircraft.site is not None:
                 write_surface(folder, self._aircraft.site, self._aircraft.datum)
         except OSError as error:
