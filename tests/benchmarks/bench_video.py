@@ -32,7 +32,7 @@ VIEWS = (
     ("field", 20.0, 0.0, 40.0), ("forest", 0.0, 0.0, 40.0), ("forest", 20.0, 30.0, 60.0),
 )  # fmt: skip
 """Site, east, north and height m of the pictures of the sheet."""
-COLUMNS, THUMBNAIL = 3, (640, 360)
+COLUMNS, THUMBNAIL = 3, (480, 270)
 
 
 def cpu_s(work):

@@ -207,9 +207,11 @@ def _between(
     f1: float,
 ) -> float:  # fmt: skip
     """Where a ray passes through the raster, above it at t0 and below at t1: regula falsi (Illinois)."""
-    t, enough = t1, 3e-5 * t1 + 1e-5
-    for _ in range(12):
-        t = (t0 * f1 - t1 * f0) / (f1 - f0)
+    t, enough = t1, 1e-4 * t1 + 1e-5
+    for _ in range(5):
+        last, t = t, (t0 * f1 - t1 * f0) / (f1 - f0)
+        if abs(t - last) < enough:
+            break
         f = oz + t * dz - raster_height(s, ox + t * dx, oy + t * dy)
         if abs(f) < enough:
             break
