@@ -20,8 +20,8 @@ from air.odometry.settings import ImuSettings
 from common.arrays import F64
 
 HEADINGS = 8
-MAX_YAW_SIGMA = np.radians(4.0)
-"""A heading that is known worse has not been found."""
+MAX_YAW_SIGMA = np.radians(12.0)
+"""A heading that is known worse has not been found; the window improves on it."""
 SAME_YAW = np.radians(30.0)
 LIKELIER = 12.0
 """By how much the error of another heading must be larger."""

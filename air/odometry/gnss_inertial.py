@@ -77,6 +77,7 @@ class GnssInertial:
         self.preprocessor = GnssPreprocessor(settings.gnss, base)
         self._lever = np.array(settings.gnss.p_body_antenna)
         self._imu = ImuBuffer(settings.imu)
+        self._felt_ns: int | None = None
         self._waiting: list[CleanEpoch] = []
         self._window: _Window | None = None
         self._velocities: list[MeasuredVelocity] = []
@@ -87,7 +88,8 @@ class GnssInertial:
     def feed(self, message: object) -> list[GnssInertialPose]:
         """The poses at the epochs that a message completes; those before initialization are not known."""
         if isinstance(message, ImuSample):
-            self._imu.add(message)
+            if self._imu.add(message):
+                self._felt_ns = message.t_ns
         elif isinstance(message, GnssEpoch):
             if message.receiver == "base":
                 self.preprocessor.add_base(message)
@@ -100,8 +102,10 @@ class GnssInertial:
         else:
             self.preprocessor.add(message)
         poses = []
-        while self._waiting and self._imu.covers(self._waiting[0].t_ns, self._waiting[0].t_ns):
-            poses += self._take(self._waiting.pop(0))
+        while self._waiting and self._felt_ns is not None and self._waiting[0].t_ns <= self._felt_ns:
+            epoch = self._waiting.pop(0)
+            if self._imu.covers(epoch.t_ns, epoch.t_ns):  # else it was before the IMU began
+                poses += self._take(epoch)
         return poses
 
     def _take(self, epoch: CleanEpoch) -> list[GnssInertialPose]:
