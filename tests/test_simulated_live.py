@@ -6,6 +6,7 @@ import time
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bus_network import client_of, collect, free_endpoint
 from device_ports import wait_for
@@ -15,10 +16,11 @@ from air.devices.status import State
 from air.sources.simulated.flown import SimulatedFlight
 from air.sources.simulated.live import LiveFlight
 from air.sources.source import open_source
+from common.bus import BusConfig, ZenohBus
 from common.keys import all_of
 from common.measurements import ImuSample, RawBytes
-from common.messages import Health, Level
-from common.streams import HEALTH, RAW_BYTES, RAW_GNSS, RAW_IMU
+from common.messages import Health, Level, MapTile
+from common.streams import HEALTH, RAW_BYTES, RAW_GNSS, RAW_IMU, TILE
 from common.wire import decode, encode
 
 URL = "sim:plain?duration=4&flight.start=air"
@@ -66,7 +68,7 @@ def test_a_computer_that_does_not_keep_up_is_told() -> None:
     assert "this computer is too slow for the flight" in imu.fault
 
 
-def test_run_flies_it_onto_the_bus_and_ends_with_it(tmp_path: Path) -> None:
+def test_run_flies_it_onto_the_bus(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     config = tmp_path / "air.toml"
     config.write_text(f'[bus]\nlisten = ["{endpoint}"]\nconnect = []\nshared_memory = false\n')
@@ -76,17 +78,18 @@ def test_run_flies_it_onto_the_bus_and_ends_with_it(tmp_path: Path) -> None:
         wait_for(lambda: _listening(endpoint), 20.0)
         bus = client_of(endpoint)
         imu, raw, gnss, health = (collect(bus, all_of(s))[0] for s in (RAW_IMU, RAW_BYTES, RAW_GNSS, HEALTH))
-        assert program.process.wait(30.0) == 0
+        wait_for(lambda: len(imu) > 300 and len(health) > 8, 20.0)
+        assert program.stop()[0] == 0
     finally:
         program.process.kill()
         program.process.wait()
     sent = {encode(m) for m in open_source(url) if isinstance(m, ImuSample | RawBytes)}
-    assert len(imu) > 300
     assert gnss
     assert {payload for _, payload in (*imu, *raw)} <= sent
     told = [decode(Health, payload) for _, payload in health]
-    assert {message.role for message in told} >= {"imu", "gnss", "base", "mavlink"}
-    assert all(message.level is Level.OK for message in told)
+    devices = {"imu", "gnss", "base", "mavlink"}
+    assert {message.role for message in told} >= devices
+    assert all(message.level is Level.OK for message in told if message.role in devices)
     bus.close()
 
 
@@ -96,3 +99,24 @@ def _listening(endpoint: str) -> bool:
     except Exception:
         return False
     return True
+
+
+@pytest.mark.slow
+def test_run_maps_what_the_camera_of_a_simulated_flight_sees(tmp_path: Path) -> None:
+    """The mapper has a process of its own, which goes to the ground by itself and ends with the flight."""
+    ground = free_endpoint()
+    config = tmp_path / "air.toml"
+    config.write_text(f'[bus]\nlisten = ["{free_endpoint()}"]\nconnect = ["{ground}"]\nshared_memory = false\n')
+    bus = ZenohBus(BusConfig("router", listen=(ground,), shared_memory=False))
+    tiles, _ = collect(bus, all_of(TILE))
+    url = "sim:playground?duration=120&flight.start=air&camera.rate_hz=2&base=off"
+    program = Program(["air", "run", "--config", str(config), "--source", url], tmp_path / "air.log")
+    try:
+        wait_for(lambda: len(tiles) > 20, 120.0)
+        assert program.stop()[0] == 0
+    finally:
+        program.process.kill()
+        program.process.wait()
+    known = [decode(MapTile, payload) for _, payload in tiles]
+    assert any(np.isfinite(tile.height).any() for tile in known)
+    bus.close()
