@@ -40,8 +40,27 @@ def fly(config: AirConfig, url: str | None = None) -> int:
     source = open_photos(url or config.source, config.pace, sleep=_sleep_until(stop))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    return _fly(config, source, stop)
+
+
+def map_photos(config: AirConfig, source_until: Callable[[Callable[[], None]], PhotoSource]) -> int:
+    """Exit code 0 after SIGTERM; until then maps photos that come from elsewhere and sends the map.
+
+    `source_until` makes their source from a function that raises once they are not wanted any more. Raises BusError.
+    """
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+
+    def check_stop() -> None:
+        if stop.is_set():
+            raise StoppedError
+
+    return _fly(config, source_until(check_stop), stop)
+
+
+def _fly(config: AirConfig, source: PhotoSource, stop: threading.Event) -> int:
     flight = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    log.info("flight %s of %s: %d photos from %s", flight, config.vehicle, len(source), source.url)
+    log.info("flight %s of %s: photos from %s", flight, config.vehicle, source.url)
     warm_up()
     bus = ZenohBus(config.bus)
     uplink = Uplink(bus, config.vehicle, flight, config.uplink, SystemClock().now_ns)

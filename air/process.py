@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import replace
+from operator import length_hint
 from pathlib import Path
 
 from tqdm import tqdm
@@ -37,7 +38,10 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
     with watch.stage("adjustment"):
         keyframes = alignment.finish()
     if alignment.datum is None:
-        raise SourceError(f"{url}: none of {len(source)} photos could be placed: {_why(alignment, source)}")
+        read = len(alignment.statuses())
+        if not read:
+            raise SourceError(f"{url}: gives no photos: no camera frames with positions from the air")
+        raise SourceError(f"{url}: none of {read} photos could be placed: {_why(alignment, source)}")
     with watch.stage("mapping"):
         tiles = _map(keyframes, mapper, alignment, quiet)
     with watch.stage("export"):
@@ -59,7 +63,7 @@ def _make_folder(out: Path) -> None:
 
 def _align(source: PhotoSource, alignment: Alignment, mapper: Mapper, config: AirConfig, quiet: bool) -> None:
     photos = prepared(source, config.alignment)
-    for index, photo in enumerate(tqdm(photos, "aligning", len(source), unit="photo", disable=quiet)):
+    for index, photo in enumerate(tqdm(photos, "aligning", length_hint(source) or None, unit="photo", disable=quiet)):
         alignment.add(photo)
         if photo.image is not None:
             mapper.add_image(index, photo.image)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 from air.config import AirConfig
 from air.devices.status import DeviceStatus
+from air.mapping_process import MappingProcess
+from air.sensors.calibration import Calibration
 from air.sources.live import Live
 from air.sources.source import open_source
 from common.bus import Bus, ZenohBus
@@ -34,6 +36,11 @@ class Devices(Protocol):
 
     def __iter__(self) -> Iterator[Measurement]: ...
 
+    @property
+    def cameras(self) -> Mapping[str, Calibration]:
+        """What is known of the cameras, by name."""
+        ...
+
     def statuses(self) -> list[DeviceStatus]:
         """How each device is doing now."""
         ...
@@ -48,19 +55,29 @@ class Devices(Protocol):
 
 
 def sense(config: AirConfig, url: str) -> int:
-    """Exit code 0 after SIGINT or SIGTERM, or when a simulated flight ends; until then publishes what devices measure.
+    """Exit code 0 after SIGINT or SIGTERM; until then publishes what devices measure, and maps what they see.
 
     `live:` alone takes the devices of `config`; a simulated flight, `sim:plain` and the like, is flown at the pace of
     time. Raises SourceError, ConfigError and BusError.
     """
     live = _open(config, url)
+    stop = threading.Event()
+
+    def end(*_: object) -> None:
+        stop.set()
+        live.close()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: live.close())
+        signal.signal(number, end)
     bus = ZenohBus(config.bus)
-    sensing = Sensing(live, bus, config.vehicle, SystemClock())
+    mapping = MappingProcess(config, live.cameras)
+    sensing = Sensing(live, bus, config.vehicle, SystemClock(), mapping.take)
     try:
         sensing.run()
+        mapping.finish()
+        stop.wait()
     finally:
+        mapping.close()
         live.close()
         bus.close()
     return 0
@@ -82,8 +99,11 @@ def _open(config: AirConfig, url: str) -> Devices:
 class Sensing:
     """Source → bus, until the source is closed."""
 
-    def __init__(self, live: Devices, bus: Bus, vehicle: str, clock: Clock) -> None:
-        self._live, self._bus, self._vehicle, self._clock = live, bus, vehicle, clock
+    def __init__(
+        self, live: Devices, bus: Bus, vehicle: str, clock: Clock, tap: Callable[[Measurement], None] | None = None
+    ) -> None:
+        """`tap` is given every measurement after it was published."""
+        self._live, self._bus, self._vehicle, self._clock, self._tap = live, bus, vehicle, clock, tap
         self._ended = threading.Event()
         self._beat = threading.Thread(target=self._beat_on, name="beat", daemon=True)
 
@@ -95,6 +115,8 @@ class Sensing:
         try:
             for measurement in self._live:
                 self._publish(STREAM_OF[type(measurement)], measurement)
+                if self._tap is not None:
+                    self._tap(measurement)
         finally:
             self._ended.set()
             corrections.close()

@@ -1,11 +1,11 @@
 #!/bin/sh
-# A flight over a simulated village, mapped while it lasts: ground station and aircraft on this machine.
+# A flight over a simulated sports ground, mapped while it lasts: ground station and aircraft on this machine.
 # Usage: deploy/demo.sh [SOURCE]     stops both with Ctrl-C. PYTHON names the interpreter that Luojia is installed in.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 python=${PYTHON:-$root/.venv/bin/python}
-source=${1:-sim:survey?seed=1&photos=60}
+source=${1:-sim:playground?seed=1&duration=300&camera.rate_hz=2&base=off}
 viewer_port=8080
 bus_port=7447
 

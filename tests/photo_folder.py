@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image, TiffImagePlugin
 
-from air.sources.exif import GPS_EPOCH
+from air.sources.exif import EPOCH
 from common.messages import GnssFix, Photo
 
 FOCAL_MM = 4.5
@@ -15,7 +15,7 @@ FOCAL_MM = 4.5
 def write_photo(folder: Path, photo: Photo, name: str = "", clock: datetime | None = None) -> Path:
     """Write a photo, without position if it has no fix, under another name or with another clock if asked."""
     path = folder / (name or photo.name)
-    path.write_bytes(with_exif(photo, clock or GPS_EPOCH + timedelta(microseconds=photo.t_ns // 1000)))
+    path.write_bytes(with_exif(photo, clock or EPOCH + timedelta(microseconds=photo.t_ns // 1000)))
     return path
 
 

@@ -169,9 +169,9 @@ def refusal(source: str, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
         ("photos:{}/empty", "holds no *.jpg"),
         ("photos:{}/missing", "does not exist"),
         ("photos:{}/notes.txt", "is a file, not a folder"),
-        ("video:{}", "no known scheme; use one of photos, sim"),
+        ("tape:{}", "no known scheme; use one of "),
         ("{}", "no known scheme"),
-        ("sim:race", "there is no simulated flight 'race'"),
+        ("sim:race", "there is no site 'race'"),
         ("sim:survey?photos=many", "'photos' is 'many', must be a whole number from 2 to 500"),
     ],
 )

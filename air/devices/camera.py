@@ -61,6 +61,7 @@ class CameraReader:
     ) -> None:
         self._config, self._take, self._open_it = config, take, open_it
         known = read_calibration(Path(config.calibration).expanduser()) if config.calibration else None
+        self.calibrations = {NAME: known} if known else {}
         realsense = config.device.startswith("realsense")
         self._camera = Camera(
             NAME,

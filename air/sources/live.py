@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from air.devices.camera import CameraReader
 from air.devices.port import Arrival, Port
 from air.devices.settings import DevicesConfig, PortConfig
 from air.devices.status import DeviceStatus
+from air.sensors.calibration import Calibration
 from air.sensors.driver import Driver, TimeScale
 from air.sensors.rtcm import RtcmFilter
 from air.sources.source import Problem, Truth
@@ -53,8 +54,11 @@ class Live:
         self._readers: list[Port | CameraReader] = [
             Port(driver, config, self._put) for driver, config in _ports(devices)
         ]
+        self._cameras: Mapping[str, Calibration] = {}
         if devices.camera.device:
-            self._readers.append(CameraReader(devices.camera, self._put))
+            camera = CameraReader(devices.camera, self._put)
+            self._cameras = camera.calibrations
+            self._readers.append(camera)
 
     @property
     def url(self) -> str:
@@ -74,6 +78,11 @@ class Live:
         if self._dropped:
             found.append(Problem("live", f"{self._dropped} arrivals were dropped: nobody read them in time"))
         return [problem for problem in found if problem.name not in well]
+
+    @property
+    def cameras(self) -> Mapping[str, Calibration]:
+        """The calibration of the camera by its name, when there is one."""
+        return self._cameras
 
     def statuses(self) -> list[DeviceStatus]:
         """How each device is doing now."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import length_hint
 
 from air.sources.source import PhotoSource, Problem, Truth
 from common.messages import Photo
@@ -36,8 +37,8 @@ class Paced:
         """The problems of the source."""
         return self.source.problems
 
-    def __len__(self) -> int:
-        return len(self.source)
+    def __length_hint__(self) -> int:
+        return length_hint(self.source)
 
     def __iter__(self) -> Iterator[Photo]:
         first_t_ns: int | None = None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast
 
 from common.errors import SourceError
 from common.measurements import Measurement
@@ -55,13 +55,10 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[Sensed]: ...
 
 
-@runtime_checkable
 class PhotoSource(Source, Protocol):
-    """A source of nothing but photos, which knows how many it has."""
+    """A source of nothing but photos. One that knows how many has a length."""
 
     def __iter__(self) -> Iterator[Photo]: ...
-
-    def __len__(self) -> int: ...
 
 
 def open_source(url: str) -> Source:
@@ -88,20 +85,25 @@ def open_photos(
 ) -> PhotoSource:
     """The photos that a URL names, e.g. `photos:flights/monday` or `sim:survey?seed=1&photos=60`.
 
-    `pace` None gives photos as fast as they can be read, 1.0 at the pace of their time stamps, 2.0 twice as fast.
-    `clock` (monotonic, s) and `sleep` (s) serve the pace. Raises SourceError, in one line, like `open_source`, and
-    for a source of something else than photos.
+    Of a source of camera frames and positions they are frames far enough apart. `pace` None gives photos as fast as
+    they can be read, 1.0 at the pace of their time stamps, 2.0 twice as fast.
+    `clock` (monotonic, s) and `sleep` (s) serve the pace. Raises SourceError, in one line, like `open_source`.
     """
     if pace is not None and not 0.0 < pace < float("inf"):
         raise SourceError(f"source {url!r}: pace is {pace}, must be a positive number (1 = as flown)")
     source = open_source(url)
-    if not isinstance(source, PhotoSource):
-        raise SourceError(f"source {url!r} gives no photos; use photos:DIR or sim:survey")
+    photos = cast(PhotoSource, source) if isinstance(source, Sized) else _stills_of(source)
     if pace is None:
-        return source
+        return photos
     from air.sources.pace import Paced
 
-    return Paced(source, pace, clock, sleep)
+    return Paced(photos, pace, clock, sleep)
+
+
+def _stills_of(source: Source) -> PhotoSource:
+    from air.sources.stills import stills_of
+
+    return stills_of(source)
 
 
 def _open_photos(url: str, rest: str) -> Source:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from air.devices.status import DeviceStatus, Watch
+from air.sensors.calibration import Calibration
 from air.sources.simulated.flown import Heard, SimulatedFlight
 from common.measurements import Measurement
 
@@ -21,6 +22,11 @@ class LiveFlight:
         self._flight, self._now_s = flight, now_s
         self._closed = threading.Event()
         self._watches: dict[str, Watch] = {}
+
+    @property
+    def cameras(self) -> Mapping[str, Calibration]:
+        """What was calibrated of the cameras, by name."""
+        return self._flight.known.cameras
 
     def statuses(self) -> list[DeviceStatus]:
         """How each device that was heard is doing now."""

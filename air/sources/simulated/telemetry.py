@@ -101,7 +101,8 @@ class SimulatedTelemetry:
         self._height = GaussMarkov(rng, 1.0, _HEIGHT_TIME_S, seconds)
         self._velocity = GaussMarkov(rng, 1.0, _ATTITUDE_TIME_S, seconds, 3)
         self._attitude = GaussMarkov(rng, 1.0, _ATTITUDE_TIME_S, seconds, 3)
-        self._home = trajectory.at(np.zeros(1)).p_world[0]
+        # Home is where it took off, also for a flight that is joined in the air.
+        self._home = trajectory.at(np.zeros(1)).p_world[0] - mission.reference(0.0, 0.01, 1).p[0]
         self._writer = PacketWriter()
 
     def packets(self) -> Iterator[tuple[float, bytes]]:
