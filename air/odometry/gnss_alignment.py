@@ -62,10 +62,10 @@ def align_yaw(v_local: F64, v_enu: F64, sigma: F64) -> YawAlignment | str:
     left = enu - np.exp(1j * yaw) * local
     misfit = float(np.sqrt(np.sum(weight * np.abs(left) ** 2) / (2 * len(left) - 1)))
     yaw_sigma = float(max(misfit, 1.0) / np.sqrt(power))
-    if yaw_sigma > MAX_YAW_SIGMA:
-        return f"yaw known to {np.degrees(yaw_sigma):.1f}° only: it takes moving"
     if misfit > MAX_MISFIT:
         return f"local velocity and Doppler contradict each other: {misfit:.1f} sigmas"
+    if yaw_sigma > MAX_YAW_SIGMA:
+        return f"yaw known to {np.degrees(yaw_sigma):.1f}° only: it takes moving"
     return YawAlignment(yaw, yaw_sigma, misfit)
 
 

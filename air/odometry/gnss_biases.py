@@ -84,15 +84,14 @@ def needed(epochs: Iterable[CleanEpoch], noise: GnssNoise) -> dict[Bias, tuple[P
     for epoch in epochs:
         t_ns = epoch.t_ns
         for i, satellite in enumerate(epoch.satellites):
-            code, carrier = float(epoch.code[i]), float(epoch.carrier[i])
-            if np.isfinite(code):
+            if np.isfinite(epoch.code[i]):
                 multipath = Process(0.0, float(epoch.sigma_multipath[i]), noise.multipath_s)
                 found[Kind.MULTIPATH, satellite] = multipath, t_ns
                 found[Kind.SLOW, satellite] = Process(0.0, float(epoch.sigma_slow[i]), noise.slow_s), t_ns
             if epoch.arcs[i]:
                 key = Kind.AMBIGUITY, epoch.arcs[i]
                 mean = found[key][0].mean if key in found else np.nan
-                mean = carrier - code if np.isnan(mean) else mean
+                mean = float(epoch.offset[i]) if np.isnan(mean) else mean
                 found[key] = Process(mean, SIGMA_AMBIGUITY, walk=noise.ambiguity_walk), t_ns
             if epoch.arcs[i] or np.isfinite(epoch.rate[i]):
                 found[Kind.DRIFT, epoch.arcs[i] or satellite] = (

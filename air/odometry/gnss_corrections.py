@@ -21,6 +21,8 @@ from common.geo import ecef_to_geodetic
 from common.measurements import Ephemeris, GnssEpoch
 
 _LOWEST = np.radians(5.0)
+_FAR, _FAST = 1e10, 1e5
+"""No carrier, m, and no range rate, m/s, is larger, whatever the receiver's clock does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,8 @@ class Signals:
 
     def sigma_rate(self, epoch: GnssEpoch) -> F64:
         """One sigma (M,) m/s of the rates as the receiver of their epoch says, 0 where it does not."""
-        return np.nan_to_num(epoch.sigma_doppler[self.row] * LIGHT / self.frequency)
+        with np.errstate(over="ignore"):
+            return np.nan_to_num(epoch.sigma_doppler[self.row] * LIGHT / self.frequency)
 
 
 def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
@@ -79,7 +82,9 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
     late = [group_delay(one, signal, each) for one, signal, each in zip(ephemerides, signals, f.tolist(), strict=True)]
     keep = np.isfinite(known) & np.isfinite(f) & np.isfinite(states.position).all(axis=1) & (elevation > 0)
     index = np.flatnonzero(keep)
-    carrier = epoch.carrier_phase[rows] * LIGHT / f + known + ionosphere
+    with np.errstate(over="ignore"):
+        carrier = epoch.carrier_phase[rows] * LIGHT / f + known + ionosphere
+        rate = -epoch.doppler[rows] * LIGHT / f + LIGHT * states.drift
     return Signals(
         row=rows[index],
         satellites=tuple(satellites[i] for i in index),
@@ -88,8 +93,8 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
         p_satellite=states.position[index],
         v_satellite=states.velocity[index],
         code=(epoch.pseudorange[rows] + known - ionosphere - np.array(late, float))[index],
-        carrier=np.where(epoch.half_cycle[rows], np.nan, carrier)[index],
-        rate=(-epoch.doppler[rows] * LIGHT / f + LIGHT * states.drift)[index],
+        carrier=np.where(epoch.half_cycle[rows] | ~(np.abs(carrier) < _FAR), np.nan, carrier)[index],
+        rate=np.where(np.abs(rate) < _FAST, rate, np.nan)[index],
         frequency=f[index],
         bend=bend[index],
         slant=(1.0 + 16.0 * (0.53 - angle / np.pi) ** 3)[index],

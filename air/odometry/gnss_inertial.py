@@ -35,7 +35,12 @@ GYRO_S = 0.02
 
 @dataclass(frozen=True, eq=False)
 class GnssInertialSettings:
-    """A keyframe every `keyframe_s`, `keyframes` in the window; the attitude is sought in the last `initial_s`."""
+    """A keyframe every `keyframe_s`, `keyframes` in the window; the attitude is sought in the last `initial_s`.
+
+    Pseudoranges place the world for `anchor_s`, and again when the position's sigma has grown by the factor `reanchor`.
+    In between, Doppler and carrier alone move the aircraft: what pseudoranges still learn about where the world lies
+    would make poses creep by metres, and the map with them.
+    """
 
     gnss: GnssSettings
     imu: ImuSettings
@@ -43,6 +48,8 @@ class GnssInertialSettings:
     keyframes: int = 4
     initial_s: float = 12.0
     velocity_every_s: float = 0.5
+    anchor_s: float = 15.0
+    reanchor: float = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +164,8 @@ class _Window:
         self._lever = np.array(settings.gnss.p_body_antenna)
         self._values = gtsam.Values()
         self.solved = False
+        self._began_ns = start.state.t_ns
+        self._anchor_sigma: float | None = None
         self._links: dict[int, gtsam.LinearContainerFactor] = {}
         self._keyframes = [_Keyframe(0, start.state.t_ns, [])]
         self._covariance = start.covariance
@@ -174,6 +183,8 @@ class _Window:
 
     def take(self, epoch: CleanEpoch) -> GnssInertialPose:
         """The pose at an epoch, which ends the last keyframe's stretch when it is long enough."""
+        if self._is_anchored(epoch.t_ns):
+            epoch = epoch.without_code()
         last = self._keyframes[-1]
         state, measured = self._predict(last, epoch.t_ns)
         pieces = self._buffer.between(epoch.t_ns - round(GYRO_S * SECOND_NS), epoch.t_ns)
@@ -188,6 +199,15 @@ class _Window:
             state = self._state(self._keyframes[-1])
             self._slide()
         return GnssInertialPose(state, self._datum, self._covariance)
+
+    def _is_anchored(self, t_ns: int) -> bool:
+        """Whether pseudoranges have done their work: for long enough, and the position is still as well known."""
+        s, sigma = self._settings, float(np.sqrt(np.trace(self._covariance[3:6, 3:6])))
+        if self._anchor_sigma is None:
+            if t_ns - self._began_ns < s.anchor_s * SECOND_NS:
+                return False
+            self._anchor_sigma = sigma
+        return sigma <= s.reanchor * self._anchor_sigma
 
     def _predict(self, keyframe: _Keyframe, t_ns: int) -> tuple[InertialState, gtsam.PreintegratedCombinedMeasurements]:
         state = self._state(keyframe)

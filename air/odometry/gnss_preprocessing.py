@@ -39,7 +39,7 @@ class CleanEpoch:
     (N,), all of which may be NaN. `arcs` (N,) names the unbroken carrier, empty where there is none. White noise is
     `sigma_code`, `sigma_carrier`, `sigma_rate` (N,); what stays for a while is `sigma_multipath` and `sigma_slow` (N,)
     m of the code, and `sigma_drift` (N,) m/s of Doppler and carrier. `fix` is the single-point position of the epoch,
-    None where it had none.
+    None where it had none. `offset` (N,) m is by how much carrier and code differ: a first guess of the ambiguity.
     """
 
     t_ns: int
@@ -58,7 +58,12 @@ class CleanEpoch:
     sigma_slow: F64
     sigma_drift: F64
     elevation: F64
+    offset: F64
     fix: PointPosition | None
+
+    def without_code(self) -> CleanEpoch:
+        """The epoch with its carriers and Dopplers alone."""
+        return replace(self, code=np.full(len(self.satellites), np.nan))
 
 
 class GnssPreprocessor:
@@ -173,6 +178,7 @@ class GnssPreprocessor:
             sigma_slow=np.hypot(orbit, air) * left,
             sigma_drift=np.hypot(noise.orbit_drift, noise.drift * signals.slant[first] * bend * own) * left,
             elevation=elevation,
+            offset=carrier - code,
             fix=fix,
         )
 
@@ -248,7 +254,8 @@ class _Measured:
 
 def _loudness(cn0: F64) -> F64:
     """Sigma (M,) of white noise in units of that at 45 dBHz."""
-    return np.maximum(10 ** ((_NOMINAL_CN0 - np.where(np.isnan(cn0), _NOMINAL_CN0, cn0)) / 20), _LEAST)
+    known = np.clip(np.where(np.isnan(cn0), _NOMINAL_CN0, cn0), 0.0, 60.0)
+    return np.maximum(10 ** ((_NOMINAL_CN0 - known) / 20), _LEAST)
 
 
 def _share(second: dict[str, int], signals: Signals, first: list[int]) -> F64:

@@ -1,0 +1,102 @@
+"""A simulated flight with raw GNSS and an IMU, without a camera, for tests and benchmarks of the odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from heapq import merge
+
+import numpy as np
+from gnss_scene import BASE_WORLD, broadcast
+
+from air.gnss.gnss_time import SECOND_NS
+from air.odometry.gnss_inertial import GnssInertialPose
+from air.sources.simulated.antenna import carried_antenna, fixed_antenna
+from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
+from air.sources.simulated.constellation import constellation
+from air.sources.simulated.extrinsics import ExtrinsicsOptions, draw_extrinsics
+from air.sources.simulated.gnss import BASE_STATION, SimulatedReceiver
+from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.imu import ImuOptions, SimulatedImu
+from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.multirotor import fly
+from air.sources.simulated.sky import Sky
+from air.sources.simulated.survey import START_NS
+from air.sources.simulated.trajectory import Trajectory
+from common.arrays import F64
+from common.geo import T_ecef_enu, T_world_other
+from common.measurements import GnssEpoch, ImuSample
+from common.messages import Datum
+
+DATUM = Datum("gnss-flight", 30.5355, 114.3655, 62.0)
+HOME = np.array([0.0, 0.0, 0.2])
+BASE_ECEF = T_ecef_enu(DATUM).apply(BASE_WORLD)
+
+
+@dataclass(frozen=True, eq=False)
+class GnssFlight:
+    """The truth of a flight, and all that is measured on it in order of time."""
+
+    trajectory: Trajectory
+    p_body_antenna: tuple[float, ...]
+    messages: list[object]
+
+    def truth(self, t_ns: int) -> tuple[F64, F64, F64]:
+        """Position, velocity in world and attitude at a time."""
+        motion = self.trajectory.at(np.array([(t_ns - START_NS) / SECOND_NS]))
+        return motion.p_world[0], motion.v_world[0], motion.R_world_body[0]
+
+
+def flight(
+    seed: int = 1,
+    duration_s: float = 120.0,
+    options: FlightOptions | None = None,
+    gnss: GnssOptions | None = None,
+    imu: ImuOptions | None = None,
+    base: GnssOptions | None = None,
+) -> GnssFlight:
+    """A flight with all errors on unless options say otherwise; the stamps of the IMU are right."""
+    options, gnss, imu = options or FlightOptions(), gnss or GnssOptions(), imu or ImuOptions()
+    trajectory, _ = fly(options, seed, duration_s, HOME)
+    true, nominal = draw_extrinsics(ExtrinsicsOptions(), seed)
+    above = Sky(constellation(gnss, START_NS, seed), gnss, DATUM, START_NS, seed)
+    antenna = carried_antenna(trajectory, true.p_body_antenna, DATUM)
+    receiver = SimulatedReceiver("gnss", antenna, above, gnss, seed, duration_s)
+    streams = [((START_NS + round(o.t_s * SECOND_NS), o.epoch) for o in receiver.observations())]
+    if base is not None:
+        standing = SimulatedReceiver(
+            "base", fixed_antenna(BASE_WORLD, DATUM), above, base, seed, duration_s, BASE_STATION
+        )
+        streams.append((START_NS + round(o.t_s * SECOND_NS), o.epoch) for o in standing.observations())
+    clock = DeviceClock.draw(ClockOptions.perfect(), seed, Device.IMU, duration_s)
+    felt = SimulatedImu(trajectory, DATUM, imu, seed, clock)
+    streams.append(_samples(felt, imu.delay_s))
+    timed = merge(*streams, key=lambda pair: pair[0])
+    return GnssFlight(
+        trajectory,
+        tuple(nominal.p_body_antenna.tolist()),
+        [*broadcast(above, duration_s), *(message for _, message in timed)],
+    )
+
+
+def _samples(imu: SimulatedImu, delay_s: float) -> Iterator[tuple[int, ImuSample]]:
+    for batch in imu.batches():
+        for i, t_s in enumerate((batch.t_s - delay_s).tolist()):
+            t_ns = START_NS + round(t_s * SECOND_NS)
+            yield t_ns, ImuSample(t_ns, batch.accel[i], batch.gyro[i])
+
+
+def errors(flown: GnssFlight, poses: list[GnssInertialPose]) -> tuple[F64, F64]:
+    """Position errors (N, 3) m, east, north, up, and their normalised squares (N,)."""
+    off, squares = [], []
+    for pose in poses:
+        T = T_world_other(DATUM, pose.datum) @ pose.state.T_world_body
+        error = T.t - flown.truth(pose.state.t_ns)[0]
+        off.append(error)
+        in_body = T.R.T @ error
+        squares.append(in_body @ np.linalg.solve(pose.covariance[3:6, 3:6], in_body))
+    return np.array(off), np.array(squares)
+
+
+def is_rover(message: object) -> bool:
+    return isinstance(message, GnssEpoch) and message.receiver == "gnss"

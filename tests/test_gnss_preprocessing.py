@@ -1,0 +1,169 @@
+"""Raw epochs are cleaned: what is left of good ones is the truth, what is bad is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gnss_scene import BASE_ECEF, BASE_WORLD, DATUM, broadcast, circling, rover, sky
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from air.gnss.gnss_time import SECOND_NS
+from air.gnss.orbit import geometric_range
+from air.gnss.positioning import Refused
+from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
+from air.odometry.gnss_settings import GnssSelection, GnssSettings
+from air.sources.simulated.antenna import fixed_antenna
+from air.sources.simulated.gnss import BASE_STATION, Observed, SimulatedReceiver
+from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.survey import START_NS
+from common.arrays import F64
+from common.measurements import GnssEpoch
+
+PERFECT = GnssOptions.perfect()
+
+
+def preprocessor(options: GnssOptions = PERFECT, base: F64 | None = None, carrier: bool = True) -> GnssPreprocessor:
+    found = GnssPreprocessor(GnssSettings(selection=GnssSelection(carrier=carrier)), base)
+    for message in broadcast(sky(options), 10.0):
+        found.add(message)
+    return found
+
+
+def observed(options: GnssOptions = PERFECT, seconds: float = 3.0) -> list[Observed]:
+    return list(rover(options, seconds).observations())
+
+
+def clean_all(cleaner: GnssPreprocessor, epochs: list[GnssEpoch]) -> list[CleanEpoch]:
+    cleaned = [cleaner.clean(epoch) for epoch in epochs]
+    return [clean for clean in cleaned if isinstance(clean, CleanEpoch)]
+
+
+def spread(clean: CleanEpoch, values: F64) -> F64:
+    """Measurements less the range to the true antenna, and less what all of a system share."""
+    p, _ = circling(np.array([(clean.t_ns - START_NS) / SECOND_NS]))
+    left = values - geometric_range(clean.p_satellite, p[0])[0]
+    systems = np.array(clean.systems)
+    for name in set(clean.systems):
+        left[systems == name] -= np.nanmedian(left[systems == name])
+    return np.asarray(left)
+
+
+def test_without_errors_nothing_is_left_but_clocks() -> None:
+    """Broadcast ephemerides are rounded: some centimetres; GLONASS's are integrated otherwise than flown."""
+    last = clean_all(preprocessor(), [o.epoch for o in observed()])[-1]
+    kepler = np.array([name != "R" for name in last.systems])
+    assert len(last.satellites) > 20
+    assert np.abs(spread(last, last.code)[kepler]).max() < 0.1
+    assert np.sum([arc != "" for arc in last.arcs]) > 20
+
+
+def test_the_time_of_an_epoch_is_free_of_the_receivers_clock() -> None:
+    options = replace(PERFECT, clock=1.0, clock_drift_ppm=0.5)
+    epochs = observed(options)
+    cleaned = clean_all(preprocessor(options), [o.epoch for o in epochs])
+    off_ns = [clean.t_ns - (START_NS + o.t_s * SECOND_NS) for clean, o in zip(cleaned, epochs, strict=True)]
+    assert max(map(abs, off_ns)) < 100  # 30 m of clock; the tags differ by up to half a millisecond
+    assert max(abs(o.epoch.t_ns - START_NS - o.t_s * SECOND_NS) for o in epochs) > 10_000
+
+
+def with_change(epoch: GnssEpoch, name: str, satellite: str, change: float) -> GnssEpoch:
+    values = getattr(epoch, name).copy()
+    values[[one == satellite for one in epoch.satellites]] += change
+    return replace(epoch, **{name: values})
+
+
+@pytest.mark.parametrize("cycles", [1.0, -2.0, 40.0])
+def test_a_slipped_carrier_begins_a_new_arc(cycles: float) -> None:
+    epochs = [o.epoch for o in observed(seconds=2.0)]
+    later = [with_change(epoch, "carrier_phase", "G07", cycles) for epoch in epochs[10:]]
+    cleaner = preprocessor()
+    before = clean_all(cleaner, epochs[:10])[-1]
+    after = clean_all(cleaner, later)
+    old = dict(zip(before.satellites, before.arcs, strict=True))
+    assert [dict(zip(e.satellites, e.arcs, strict=True))["G07"] for e in after[:5]] == [""] * 5  # not locked for long
+    others = {name: arc for name, arc in zip(after[-1].satellites, after[-1].arcs, strict=True) if name != "G07"}
+    assert {name: old[name] for name in others} == others
+
+
+def test_a_pseudorange_that_its_doppler_contradicts_is_left_out() -> None:
+    epochs = [o.epoch for o in observed(seconds=1.0)]
+    cleaner = preprocessor()
+    clean_all(cleaner, epochs[:5])
+    wild = cleaner.clean(with_change(epochs[5], "pseudorange", "G07", 20.0))
+    assert isinstance(wild, CleanEpoch)
+    kept = dict(zip(wild.satellites, wild.code.tolist(), strict=True))
+    assert np.isnan(kept.get("G07", np.nan))
+    assert np.isfinite(list(kept.values())).sum() >= len(kept) - 1
+
+
+def test_weak_low_and_new_signals_are_left_out() -> None:
+    epochs = [o.epoch for o in observed(seconds=0.5)]
+    one = epochs[0].satellites[0]
+    weak = replace(epochs[0], cn0=np.where([s == one for s in epochs[0].satellites], 20.0, epochs[0].cn0))
+    first = preprocessor().clean(weak)
+    assert isinstance(first, CleanEpoch)
+    assert one not in first.satellites
+    assert first.elevation.min() >= np.radians(10.0)
+    fresh = replace(epochs[0], lock_s=np.zeros(len(epochs[0].satellites)))
+    none = preprocessor().clean(fresh)
+    assert isinstance(none, CleanEpoch)
+    assert none.satellites == ()
+
+
+def test_too_few_satellites_still_serve_who_knows_where_it_is() -> None:
+    epochs = [o.epoch for o in observed(seconds=1.0)]
+    cleaner = preprocessor()
+    clean_all(cleaner, epochs[:5])
+    keep = np.array([s in ("G07", "G03", "G14") for s in epochs[5].satellites])
+    names = {name: getattr(epochs[5], name) for name in epochs[5].__dataclass_fields__}
+    few = replace(
+        epochs[5],
+        **{name: value[keep] for name, value in names.items() if isinstance(value, np.ndarray)},
+        satellites=tuple(np.array(epochs[5].satellites)[keep]),
+        signals=tuple(np.array(epochs[5].signals)[keep]),
+    )
+    assert isinstance(cleaner.clean(few), Refused)
+    near = circling(np.array([0.5]))[0][0]
+    clean = cleaner.clean(few, near)
+    assert isinstance(clean, CleanEpoch)
+    assert 2 <= len(clean.satellites) <= 3
+
+
+def test_a_base_takes_off_what_both_have() -> None:
+    """Satellites and air of metres are gone; the antennas' own noise and multipath are off here."""
+    options = replace(
+        PERFECT, orbit=0.6, satellite_clock=0.5, ionosphere_residual=1.0, troposphere_residual=0.1, inter_system=1.0
+    )
+    above = sky(options)
+    base = SimulatedReceiver("base", fixed_antenna(BASE_WORLD, DATUM), above, options, 1, 3.0, BASE_STATION)
+    alone, helped = preprocessor(options), preprocessor(options, BASE_ECEF)
+    for epoch in [o.epoch for o in base.observations()]:
+        if epoch.t_ns <= START_NS + 2 * SECOND_NS:
+            helped.add_base(epoch)
+    last = observed(options, 2.5)[-8:]
+    apart = clean_all(alone, [o.epoch for o in last])[-1]
+    both = clean_all(helped, [o.epoch for o in last])[-1]
+    assert set(both.systems) <= {"G-base", "E-base", "R-base", "C-base"}
+    assert np.abs(spread(apart, apart.code)).max() > 1.0
+    assert np.abs(spread(both, both.code)).max() < 0.05
+    assert both.sigma_slow.max() < 0.1 * apart.sigma_slow.max()
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1))
+def test_nonsense_never_ends_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cleaner = preprocessor()
+    for o in EPOCHS:
+        change = {
+            name: np.where(rng.random(len(o.satellites)) < 0.3, rng.choice([np.nan, 0.0, -1e9, 1e300]), value)
+            for name, value in vars(o).items()
+            if isinstance(value, np.ndarray) and value.dtype == np.float64
+        }
+        assert isinstance(cleaner.clean(replace(o, **change)), CleanEpoch | Refused)
+
+
+EPOCHS = [o.epoch for o in observed(seconds=0.3)]
