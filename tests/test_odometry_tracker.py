@@ -118,6 +118,21 @@ def test_points_are_spread_and_no_more_than_asked_for() -> None:
         assert distance.min() > 40.0
 
 
+def test_points_that_crowd_together_make_room() -> None:
+    """As in a climb: each image shows more, and what was seen shrinks to its middle."""
+    images = [cv2.resize(GROUND, None, fx=z, fy=z, interpolation=cv2.INTER_AREA) for z in np.linspace(2.0, 0.9, 12)]
+    middles = [(im.shape[0] // 2, im.shape[1] // 2) for im in images]
+    views = [
+        np.ascontiguousarray(im[v - 240 : v + 240, u - 320 : u + 320])
+        for im, (v, u) in zip(images, middles, strict=True)
+    ]
+    last = track(*views)[-1]
+    distance = np.linalg.norm(last.uv[:, None] - last.uv[None], axis=2) + 1e3 * np.eye(len(last.uv))
+    assert distance.min() > 0.4 * TrackerSettings().spacing
+    assert np.ptp(last.uv[:, 0]) > 500
+    assert (~last.new).sum() > 20
+
+
 def test_what_is_covered_by_something_else_is_not_followed() -> None:
     second = view((6.0, 0.0))
     second[160:320, 230:430] = texture(160, 200, seed=9)

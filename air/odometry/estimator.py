@@ -125,9 +125,9 @@ class Estimator:
             return initial
         window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
         first = initial.states[0]
-        window.begin(first, initial.sigmas, self._points_at(initial.frames[0], first, {}))
+        window.begin(first, initial.sigmas, self._points_at(initial.frames[0], first, {}, initial.depth))
         for state, seen in list(zip(initial.states, initial.frames, strict=True))[1:]:
-            window.add(seen.t_ns, self._points_at(seen, state, {}), state)
+            window.add(seen.t_ns, self._points_at(seen, state, {}, initial.depth), state)
         solution = Solution(0.0, 0, 0)
         if len(initial.states) > 1:
             solution = window.settle()
@@ -164,7 +164,9 @@ class Estimator:
     def _continue(self, window: Window, frame: TrackedFrame) -> Estimate | Refusal:
         predicted = window.predict(frame.t_ns)
         still = self._is_still(frame)
-        window.add(frame.t_ns, self._points_at(frame, predicted, window.depths(predicted)), predicted, still)
+        depths = window.depths(predicted)
+        usual = float(np.median(list(depths.values()))) if depths else np.inf
+        window.add(frame.t_ns, self._points_at(frame, predicted, depths, usual), predicted, still)
         solution = window.solve()
         if why := self._astray(window, solution, predicted):
             return self._repair(window, frame, predicted, why)
@@ -186,7 +188,9 @@ class Estimator:
         mode = self._monitor.update(newest.t_ns, points)
         return Estimate(window.state(), window.pose_covariance, mode, self.revision, solution, keyframe, note)
 
-    def _points_at(self, frame: TrackedFrame, state: InertialState, depths: dict[int, float]) -> dict[int, F64]:
+    def _points_at(
+        self, frame: TrackedFrame, state: InertialState, depths: dict[int, float], usual: float
+    ) -> dict[int, F64]:
         """What a frame sees, moved from the times of its rows to its own."""
         pieces = self.buffer.between(frame.t_ns - HALF_GYRO_NS, frame.t_ns + HALF_GYRO_NS)
         omega = np.zeros(3)
@@ -194,7 +198,7 @@ class Estimator:
             omega = pieces.dt_s @ pieces.gyro / pieces.dt_s.sum() - state.gyro_bias
         v_body = state.T_world_body.R.T @ state.v_world + np.cross(omega, self._T_body_cam.t)
         R = self._T_body_cam.R.T
-        return ideal_points(frame, self._focal, R @ omega, R @ v_body, depths)
+        return ideal_points(frame, self._focal, R @ omega, R @ v_body, depths, usual)
 
     def _remember(self, frame: TrackedFrame) -> None:
         """Keep the frames since just before the time that tells whether the aircraft stands."""
@@ -235,7 +239,7 @@ class Estimator:
             self._window, self._initialization = None, self._new_initialization()
             return Refusal(f"begins anew, because {why}")
         state = self._plausible(predicted)
-        window.begin(state, AGAIN, self._points_at(frame, state, {}))
+        window.begin(state, AGAIN, self._points_at(frame, state, {}, np.inf))
         self._propagate_from(state)
         return self._estimate(window, Solution(0.0, 0, 0), note=f"window started anew: {why}")
 

@@ -15,11 +15,15 @@ from common.arrays import F64
 
 @dataclass(frozen=True, eq=False)
 class Initial:
-    """States of some frames, the first of them known within `sigmas`; z is up, yaw and position are free."""
+    """States of some frames, the first of them known within `sigmas`; z is up, yaw and position are free.
+
+    The scene is about as far as `depth` m.
+    """
 
     states: Sequence[InertialState]
     frames: Sequence[TrackedFrame]
     sigmas: Sigmas
+    depth: float = float("inf")
 
 
 @dataclass(frozen=True)

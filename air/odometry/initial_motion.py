@@ -87,7 +87,7 @@ def initial_in_motion(
         v = R_world_first @ (aligned.v_first + gravity * t + motion.v[i])
         states.append(InertialState(frame.t_ns, SE3(R_world_first @ motion.R[i], p), v, np.zeros(3), gyro_bias))
     sigmas = Sigmas(LOOSE_TILT, 1e-4, 1e-3, sigma_v, imu.accel_bias_sigma, imu.gyro_bias_sigma)
-    return Initial(states, frames, sigmas)
+    return Initial(states, frames, sigmas, depth=1.0 / aligned.one_over_scale)
 
 
 def parallax(first: TrackedFrame, last: TrackedFrame, R_first_last: F64) -> float:

@@ -15,14 +15,13 @@ from common.arrays import F64
 
 
 def ideal_points(
-    frame: TrackedFrame, focal: float, omega_cam: F64, v_cam: F64, depth: Mapping[int, float]
+    frame: TrackedFrame, focal: float, omega_cam: F64, v_cam: F64, depth: Mapping[int, float], usual: float
 ) -> dict[int, F64]:
     """Ideal image points (2,) px by id at the frame's `t_ns`, from the centre of the image.
 
     The camera turns by `omega_cam` (3,) rad/s and moves by `v_cam` (3,) m/s, both in its own axes; a point without a
-    depth m along the axis is taken to be as far as the median of the others, or at infinity.
+    `depth` m along the axis is taken to be as far as `usual`.
     """
-    usual = float(np.median(list(depth.values()))) if depth else np.inf
     z = np.array([depth.get(i, usual) for i in frame.ids.tolist()])
     p = frame.rays / frame.rays[:, 2:]
     moved = p + frame.row_dt_s[:, None] * (np.cross(omega_cam, p) + v_cam / z[:, None])

@@ -17,8 +17,9 @@ from common.camera import CameraModel
 
 CONFIDENCE, ITERATIONS = 0.999, 500
 MIN_FOR_GEOMETRY = 12
-DETECTION_SCALE = 0.5
-"""Corners are sought in a smaller image: a quarter of the work, and those found are less prone to blur."""
+DETECTION_SCALE, CROWDED = 0.5, 0.5
+"""Corners are sought in a smaller image: a quarter of the work, and those found are less prone to blur. Points nearer
+than half the spacing are crowded."""
 MIN_CONTRAST = 2.0
 """Standard deviation of an image, gray levels, below which nothing is seen in it."""
 BRIGHTNESS, CONTRAST = 128.0, 50.0
@@ -71,9 +72,10 @@ class Tracker:
         if self._last is not None and len(self._ids):
             self._follow(self._last, even, R_last_now)
         self._last = even
+        free = self._thin()
         known = len(self._ids)
         if not dull:
-            self._detect(even)
+            self._detect(even, free)
         return self._frame(t_ns, line_time_s, known, dull)
 
     def forget(self, ids: I64) -> None:
@@ -142,18 +144,33 @@ class Tracker:
         _, mask = cv2.findFundamentalMat(xy_a, xy_b, cv2.USAC_MAGSAC, threshold, CONFIDENCE, ITERATIONS)
         return np.ones(len(before), bool) if mask is None else mask.ravel().astype(bool)
 
-    def _detect(self, image: U8) -> None:
+    def _thin(self) -> U8:
+        """Let go of points that have come close to older ones, as all do in a climb; 255 where new ones may be.
+
+        Points that crowd in the middle of the image cannot tell tilt from motion.
+        """
+        height, width = (round(n * DETECTION_SCALE) for n in (self._camera.height, self._camera.width))
+        spacing, border = (self._settings.spacing * DETECTION_SCALE, round(self._settings.border * DETECTION_SCALE))
+        free = np.zeros((height, width), np.uint8)
+        free[border : height - border, border : width - border] = 255
+        crowded, kept = np.zeros_like(free), []
+        for row in np.argsort(self._ids, kind="stable").tolist():
+            u, v = (round(float(x)) for x in self._uv[row] * DETECTION_SCALE)
+            if crowded[min(max(v, 0), height - 1), min(max(u, 0), width - 1)]:
+                continue
+            kept.append(row)
+            cv2.circle(crowded, (u, v), round(CROWDED * spacing), 255, -1)
+            cv2.circle(free, (u, v), round(spacing), 0, -1)
+        self._ids, self._uv = self._ids[kept], self._uv[kept]
+        return free
+
+    def _detect(self, image: U8, free: U8) -> None:
         """Add corners where there are none, strongest first, until there are enough."""
         missing = self._settings.features - len(self._ids)
         if missing <= 0:
             return
-        small = cv2.resize(image, None, fx=DETECTION_SCALE, fy=DETECTION_SCALE, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(image, free.shape[::-1], interpolation=cv2.INTER_AREA)
         spacing = self._settings.spacing * DETECTION_SCALE
-        free = np.full(small.shape, 255, np.uint8)
-        border = max(1, round(self._settings.border * DETECTION_SCALE))
-        free[:border], free[-border:], free[:, :border], free[:, -border:] = 0, 0, 0, 0
-        for u, v in self._uv * DETECTION_SCALE:
-            cv2.circle(free, (round(float(u)), round(float(v))), round(spacing), 0, -1)
         corners = cv2.goodFeaturesToTrack(small, missing, self._settings.quality, spacing, mask=free)
         if corners is None:
             return
