@@ -1,0 +1,120 @@
+"""GNSS and IMU without a camera: on a simulated flight against its truth, and on real recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from gnss_flight import DATUM, START_NS, GnssFlight, errors, flight
+
+from air.gnss.gnss_time import SECOND_NS
+from air.odometry.gnss_attitude import InitialAttitude, MeasuredVelocity, find_attitude
+from air.odometry.gnss_inertial import GnssInertial, GnssInertialPose, GnssInertialSettings
+from air.odometry.gnss_settings import GnssNoise, GnssSelection, GnssSettings
+from air.odometry.preintegration import ImuBuffer
+from air.odometry.settings import ImuSettings
+from air.sources.simulated.mission import FlightOptions
+from air.sources.source import open_source
+from common.arrays import F64
+from common.geo import T_world_other
+from common.gravity import normal_gravity
+from common.measurements import GnssEpoch, ImuSample
+
+IMU = replace(ImuSettings(), gravity=normal_gravity(DATUM.latitude_deg, DATUM.height))
+
+
+@pytest.fixture(scope="module")
+def flown() -> GnssFlight:
+    """Fifty seconds that begin in the air, with a turn and all errors on."""
+    return flight(2, 50.0, FlightOptions(start="air"))
+
+
+def estimate(flown: GnssFlight, carrier: bool = True, messages: list[object] | None = None) -> list[GnssInertialPose]:
+    gnss = GnssSettings(p_body_antenna=flown.p_body_antenna, selection=GnssSelection(carrier=carrier))
+    estimator = GnssInertial(GnssInertialSettings(gnss, ImuSettings()))
+    return [pose for message in messages or flown.messages for pose in estimator.feed(message)]
+
+
+@pytest.mark.parametrize("carrier", [False, True])
+def test_poses_follow_the_truth_within_their_sigma(flown: GnssFlight, carrier: bool) -> None:
+    poses = estimate(flown, carrier)
+    assert len(poses) > 100
+    off, squares = errors(flown, poses)
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 4.0  # pseudoranges of 1.5 m class place it
+    assert np.median(squares) < 14.2  # χ² of three, once in 370
+    # Once anchored it keeps its shape: what is left is a shift.
+    late = off[[pose.state.t_ns > poses[0].state.t_ns + 16 * SECOND_NS for pose in poses]]
+    assert np.abs(late - late.mean(axis=0)).max() < 0.3
+    for pose in poses[len(poses) // 2 :: 20]:
+        _, v_world, R_world_body = flown.truth(pose.state.t_ns)
+        T = T_world_other(DATUM, pose.datum)
+        assert pose.state.v_world @ T.R.T == pytest.approx(v_world, abs=0.1)
+        turn = gtsam.Rot3.Logmap(gtsam.Rot3(R_world_body.T @ T.R @ pose.state.T_world_body.R))
+        assert np.degrees(np.linalg.norm(turn)) < 2.0
+
+
+def test_the_same_measurements_give_the_same_poses(flown: GnssFlight) -> None:
+    some = [m for m in flown.messages if getattr(m, "t_ns", 0) < START_NS + 32 * SECOND_NS]
+    first, again = estimate(flown, True, some), estimate(flown, True, some)
+    assert [pose.state.T_world_body.t.tobytes() for pose in first] == [
+        pose.state.T_world_body.t.tobytes() for pose in again
+    ]
+
+
+def test_an_outage_of_gnss_is_bridged_by_the_imu(flown: GnssFlight) -> None:
+    gap = range(START_NS + 40 * SECOND_NS, START_NS + 43 * SECOND_NS)
+    heard = [m for m in flown.messages if not (isinstance(m, GnssEpoch) and m.t_ns in gap)]
+    poses = estimate(flown, True, heard)
+    off, _ = errors(flown, poses)
+    before = [pose.state.t_ns < gap.start for pose in poses].count(True)
+    assert np.linalg.norm(off[-1] - off[before - 1]) < 0.5
+
+
+def felt(R_world_body: F64, bias: F64, seconds: float = 10.0) -> tuple[ImuBuffer, list[MeasuredVelocity]]:
+    """A body that keeps its attitude and speeds up, first east and then north; a sample's mean is its value."""
+    buffer, velocities, v = ImuBuffer(IMU), [], np.zeros(3)
+    for k in range(round(seconds * 100) + 1):
+        t = k * 0.01
+        a = np.array([1.0, 0.0, 0.0]) if t < seconds / 2 else np.array([0.0, 1.5, 0.2])
+        buffer.add(ImuSample(round(t * 1e9), R_world_body.T @ (a + [0, 0, IMU.gravity]), bias))
+        if k % 50 == 0:
+            velocities.append(MeasuredVelocity(round(t * 1e9), v.copy(), np.full(3, 0.05)))
+        v = v + 0.01 * a
+    return buffer, velocities
+
+
+@pytest.mark.parametrize("yaw_deg", [-170, -60, 5, 120])
+def test_attitude_is_found_in_motion_from_any_heading(yaw_deg: float) -> None:
+    R = gtsam.Rot3.Ypr(np.radians(yaw_deg), 0.1, -0.15).matrix()
+    bias = np.array([0.01, -0.008, 0.005])
+    found = find_attitude(*felt(R, bias), IMU)
+    assert isinstance(found, InitialAttitude)
+    off = gtsam.Rot3.Logmap(gtsam.Rot3(R.T @ found.state.T_world_body.R))
+    assert np.linalg.norm(off) < np.radians(1.0)
+    assert found.state.gyro_bias == pytest.approx(bias, abs=1e-3)
+
+
+def test_attitude_is_refused_without_acceleration() -> None:
+    buffer, velocities = felt(np.eye(3), np.zeros(3))
+    still = ImuBuffer(IMU)
+    for k in range(1001):
+        still.add(ImuSample(k * 10_000_000, np.array([0, 0, IMU.gravity]), np.zeros(3)))
+    constant = [replace(velocity, v_world=np.array([3.0, 0.0, 0.0])) for velocity in velocities]
+    assert isinstance(find_attitude(still, constant, IMU), str)
+    assert find_attitude(buffer, velocities[:3], IMU) == "too few velocities"
+
+
+def test_a_car_on_a_motorway_is_followed(real_data: Callable[[str], Path]) -> None:
+    """comma2k19: the phone's clock, by which IMU and reference are stamped, is some 0.1 s ahead of the receiver's."""
+    folder = real_data("comma2k19") / "segment"
+    imu = ImuSettings(accel_noise=0.05, gyro_noise=0.002, accel_bias_sigma=0.3, gyro_bias_sigma=0.1)
+    estimator = GnssInertial(GnssInertialSettings(GnssSettings(noise=GnssNoise(rate=0.15, multipath=1.5)), imu))
+    poses = [pose for message in open_source(f"comma2k19:{folder}") for pose in estimator.feed(message)]
+    assert len(poses) > 400
+    speed = [np.linalg.norm(pose.state.v_world) for pose in poses]
+    assert 5.0 < min(speed) < max(speed) < 30.0
+    assert poses[-1].covariance[3:6, 3:6].trace() < 5.0**2
