@@ -40,6 +40,7 @@ class GnssFlight:
     trajectory: Trajectory
     p_body_antenna: tuple[float, ...]
     messages: list[object]
+    start_ns: int = START_NS
 
     def truth(self, t_ns: int) -> tuple[F64, F64, F64]:
         """Position, velocity in world and attitude at a time."""

@@ -17,7 +17,7 @@ from air.odometry.gnss_attitude import InitialAttitude, MeasuredVelocity, find_a
 from air.odometry.gnss_biases import BiasNode, first_node, needed, next_node, start_values
 from air.odometry.gnss_factors import Linearised, antenna_motion, as_factor, linearise, total
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
-from air.odometry.gnss_prior import Prior, marginalize
+from air.odometry.gnss_prior import Prior, marginalize, step
 from air.odometry.gnss_settings import GnssSettings
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
 from air.odometry.settings import ImuSettings
@@ -56,12 +56,13 @@ class GnssInertialSettings:
 class GnssInertialPose:
     """State of the body in world (ENU at `datum`) at an epoch; `covariance` (15, 15) of the last keyframe.
 
-    Its columns are rotation and position in body axes, velocity, biases.
+    Its columns are rotation and position in body axes, velocity, biases. Until it is `anchored`, the world still moves.
     """
 
     state: InertialState
     datum: Datum
     covariance: F64
+    anchored: bool
 
 
 @dataclass(eq=False)
@@ -183,7 +184,8 @@ class _Window:
 
     def take(self, epoch: CleanEpoch) -> GnssInertialPose:
         """The pose at an epoch, which ends the last keyframe's stretch when it is long enough."""
-        if self._is_anchored(epoch.t_ns):
+        anchored = self._is_anchored(epoch.t_ns)
+        if anchored:
             epoch = epoch.without_code()
         last = self._keyframes[-1]
         state, measured = self._predict(last, epoch.t_ns)
@@ -198,7 +200,7 @@ class _Window:
             self._solve()
             state = self._state(self._keyframes[-1])
             self._slide()
-        return GnssInertialPose(state, self._datum, self._covariance)
+        return GnssInertialPose(state, self._datum, self._covariance, anchored)
 
     def _is_anchored(self, t_ns: int) -> bool:
         """Whether pseudoranges have done their work: for long enough, and the position is still as well known."""
@@ -252,16 +254,12 @@ class _Window:
         keyframe.node = node
 
     def _solve(self) -> None:
+        nodes = {keyframe.node.key: None for keyframe in self._keyframes if keyframe.node is not None}
+        keys = [*nodes, *(symbol(k.index) for k in self._keyframes for symbol in (X, V, B))]
         for iteration in range(ITERATIONS):
             graph = self._graph(self._keyframes, self._keyframes[-2] if iteration == 0 else None)
-            linear = graph.linearize(self._values)
-            self._values = self._values.retract(linear.optimize())
+            self._values, self._covariance = step(graph, self._values, keys)
         self.solved = True
-        last = self._keyframes[-1].index
-        keys = [X(last), V(last), B(last)]
-        others = [key for key in linear.keyVector() if key not in keys]
-        left = linear.eliminatePartialSequential(gtsam.Ordering(others))[1]
-        self._covariance = np.linalg.inv(left.hessian(gtsam.Ordering(keys))[0])
 
     def _graph(self, keyframes: list[_Keyframe], new: _Keyframe | None) -> gtsam.NonlinearFactorGraph:
         """The prior and all factors that begin at some keyframes; the epochs of a `new` one are not weighted down."""

@@ -71,8 +71,36 @@ def marginalize(
 ) -> Prior:
     """The prior on the `staying` keys of a graph (pose, velocity, IMU biases, node) after the `leaving` are eliminated.
 
-    Raises RuntimeError (of gtsam) where the graph does not determine the leaving keys.
+    Raises LinAlgError where the graph does not determine the leaving keys.
     """
-    left = graph.linearize(values).eliminatePartialSequential(gtsam.Ordering(list(leaving)))[1]
-    G, g = left.hessian(gtsam.Ordering(list(staying)))
-    return Prior.at(Linearised(G, np.asarray(g).ravel(), 0.0, 0, 0.0), staying, values)
+    H, g, sizes = _dense(graph, values, [*leaving, *staying])
+    gone = sum(sizes[: len(leaving)])
+    way = np.linalg.solve(H[:gone, :gone], np.column_stack([H[:gone, gone:], g[:gone]]))
+    G = H[gone:, gone:] - H[gone:, :gone] @ way[:, :-1]
+    return Prior.at(Linearised((G + G.T) / 2, g[gone:] - H[gone:, :gone] @ way[:, -1], 0.0, 0, 0.0), staying, values)
+
+
+def step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]) -> tuple[gtsam.Values, F64]:
+    """Values after one Gauss–Newton step, and the covariance (15, 15) of the last three keys.
+
+    gtsam's own elimination takes a position that is known to metres, beside a turn known to milliradians, for one that
+    is not known at all; so the few hundred unknowns are solved for as one matrix. Raises LinAlgError where the graph
+    does not determine the keys.
+    """
+    H, g, sizes = _dense(graph, values, keys)
+    last = np.eye(len(H))[:, -STATES:]
+    scale = 1 / np.sqrt(np.diag(H))
+    solved = scale[:, None] * np.linalg.solve(H * np.outer(scale, scale), scale[:, None] * np.column_stack([g, last]))
+    delta, begin = gtsam.VectorValues(), 0
+    for key, size in zip(keys, sizes, strict=True):
+        delta.insert(key, solved[begin : begin + size, 0])
+        begin += size
+    return values.retract(delta), np.asarray(solved[-STATES:, 1:])
+
+
+def _dense(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]) -> tuple[F64, F64, list[int]]:
+    """Hessian, gradient and sizes of the keys, linear at some values."""
+    H, g = graph.linearize(values).hessian(gtsam.Ordering(list(keys)))
+    kinds = {"x": 6, "v": 3, "b": 6}
+    sizes = [kinds.get(chr(gtsam.symbolChr(key))) or len(values.atVector(key)) for key in keys]
+    return np.asarray(H), np.ravel(g), sizes
