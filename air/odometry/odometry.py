@@ -22,8 +22,8 @@ from common.messages import EstimatorState, Keyframe, Mode, Photo, Pose
 Output = Pose | Keyframe | EstimatorState
 WAITING = 60
 """Frames that wait for the IMU; older ones are given up."""
-MIN_SIGMA_SPEED = 0.1
-"""m/s; receivers are confident."""
+MIN_SIGMA_SPEED, UNKNOWN_SIGMA_SPEED = 0.1, 0.5
+"""m/s, of what a receiver says: some are confident, some do not tell."""
 EVERY_NS = 1_000_000_000
 """Between two `EstimatorState`."""
 
@@ -73,9 +73,10 @@ class Odometry:
         place = (solution.latitude_deg, solution.height)
         if solution.kind is not FixKind.NONE and np.isfinite(place).all():
             self.estimator.set_gravity(normal_gravity(*place))
-        if np.isfinite([*solution.v_enu, solution.sigma_velocity]).all():
-            speed = float(np.linalg.norm(solution.v_enu))
-            self.estimator.add_speed(KnownSpeed(solution.t_ns, speed, max(solution.sigma_velocity, MIN_SIGMA_SPEED)))
+        if np.isfinite(solution.v_enu[:2]).all():
+            sigma = solution.sigma_velocity if np.isfinite(solution.sigma_velocity) else UNKNOWN_SIGMA_SPEED
+            speed = float(np.linalg.norm(np.nan_to_num(solution.v_enu)))  # some tell nothing about the vertical
+            self.estimator.add_speed(KnownSpeed(solution.t_ns, speed, max(sigma, MIN_SIGMA_SPEED)))
 
     def _frames(self) -> list[Output]:
         """What the waiting frames tell that IMU samples cover by now."""

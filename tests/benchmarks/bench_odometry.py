@@ -116,7 +116,7 @@ def main():
     figures = [
         Figure("travelled", "m", 0),
         Figure("RMSE after alignment", "m", 2),
-        Figure("error at the end, of the distance", "%", 2, most=0.5),
+        Figure("error at the end, of the distance", "%", 2, most=0.005),
         Figure("scale", "", 4),
         Figure("NEES of position, 3 expected", "", 1),
         Figure("CPU time of a frame, median", "s", 3, most=0.06),
