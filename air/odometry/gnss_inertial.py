@@ -28,9 +28,12 @@ from common.measurements import GnssEpoch, ImuSample
 from common.messages import Datum
 from common.se3 import SE3
 
+BASE = "base"
 SIGMA_ANCHOR = 30.0
+"""What the first single-point position is worth beside the ranges, m."""
 ITERATIONS = 2
 GYRO_S = 0.02
+"""The rate of turn that swings the antenna is the mean over so long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +83,7 @@ class GnssInertial:
     """Core of the estimator: feed it messages in order of time."""
 
     def __init__(self, settings: GnssInertialSettings, base: F64 | None = None) -> None:
-        """`base` (3,) m, ECEF, is where the base station stands, whose epochs have another receiver's name."""
+        """`base` (3,) m, ECEF, is where the base station stands, whose epochs name "base" as their receiver."""
         self._settings = settings
         self.preprocessor = GnssPreprocessor(settings.gnss, base)
         self._lever = np.array(settings.gnss.p_body_antenna)
@@ -99,7 +102,7 @@ class GnssInertial:
             if self._imu.add(message):
                 self._felt_ns = message.t_ns
         elif isinstance(message, GnssEpoch):
-            if message.receiver == "base":
+            if message.receiver == BASE:
                 self.preprocessor.add_base(message)
                 return []
             clean = self.preprocessor.clean(message, self._near)

@@ -1,8 +1,8 @@
 """From the raw measurements of an epoch to those that the odometry can believe.
 
 Elevation mask, satellites seen for a while, C/N0 and standard-deviation gates, residual tests, and both bands as one:
-the mean of their codes and Dopplers, and the carrier free of the ionosphere where both are locked. Source: Wang et al.
-(seed of this project), 3.3; Misra and Enge, Global Positioning System, 5.7.
+the mean of their codes and Dopplers, and the carrier free of the ionosphere where both are locked. Sources: Cao, Lu,
+Shen, GVINS (2022), section IV; Misra and Enge, Global Positioning System, 5.7.
 """
 
 from __future__ import annotations
