@@ -1,6 +1,6 @@
 """Observations of a rolling shutter, moved to where they would have been at the time of the frame.
 
-Source: C. Forster et al., and C. Albl, Z. Kukelova, T. Pajdla, R6P: rolling shutter absolute camera pose (2015), whose
+Source: C. Albl, Z. Kukelova, T. Pajdla, R6P: rolling shutter absolute camera pose (2015), whose
 linear motion of the camera during a frame is used.
 """
 
