@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from air.sources.simulated.antenna import fixed_antenna
 from air.sources.simulated.gnss import BASE_STATION, Observed, SimulatedReceiver
 from air.sources.simulated.gnss_options import GnssOptions
 from air.sources.simulated.survey import START_NS
+from air.sources.source import open_source
 from common.arrays import F64
 from common.measurements import GnssEpoch
 
@@ -167,3 +171,42 @@ def test_nonsense_never_ends_it(seed: int) -> None:
 
 
 EPOCHS = [o.epoch for o in observed(seconds=0.3)]
+
+
+def test_unbroken_carriers_of_a_real_receiver_tell_the_way_between_epochs(real_data: Callable[[str], Path]) -> None:
+    """A walk with an F9P in the hand at 1 Hz: steps of a walker, where single points jump by metres.
+
+    Doppler tells the velocity at the epochs alone, and the hand swings in between: a metre at most.
+    """
+    cleaner = GnssPreprocessor(GnssSettings())
+    cleaned: list[CleanEpoch] = []
+    for message in open_source(f"ubx:{real_data('gnss') / 'nhm.ubx'}"):
+        if isinstance(message, GnssEpoch):
+            clean = cleaner.clean(message)
+            cleaned += [clean] if isinstance(clean, CleanEpoch) and clean.fix is not None else []
+        else:
+            cleaner.add(message)
+    ways = [(way_by_carriers(a, b), a, b) for a, b in pairwise(cleaned)]
+    known = [(way, a, b) for way, a, b in ways if way is not None]
+    assert len(known) > 15
+    for way, a, b in known:
+        assert a.fix is not None
+        assert b.fix is not None
+        dt = (b.t_ns - a.t_ns) / SECOND_NS
+        assert np.linalg.norm(way - (a.fix.velocity + b.fix.velocity) / 2 * dt) < 1.0
+    lengths = np.array([np.linalg.norm(way) for way, _, _ in known])
+    assert np.abs(np.diff(lengths)).max() < 1.0  # it stops within a second
+    assert lengths.max() < 1.6
+
+
+def way_by_carriers(a: CleanEpoch, b: CleanEpoch) -> F64 | None:
+    """Displacement (3,) m, ECEF, between two epochs by the carriers that both have, if those are enough."""
+    assert a.fix is not None
+    here, there = geometric_range(a.p_satellite, a.fix.position)[0], geometric_range(b.p_satellite, a.fix.position)
+    then = {arc: a.carrier[i] - here[i] for i, arc in enumerate(a.arcs) if arc}
+    both = [i for i, arc in enumerate(b.arcs) if arc in then]
+    if len(both) < 8:
+        return None
+    moved = np.array([b.carrier[i] - there[0][i] - then[b.arcs[i]] for i in both])
+    H = np.column_stack([-there[1][both], np.ones(len(both))])
+    return np.asarray(np.linalg.lstsq(H, moved, rcond=None)[0][:3])
