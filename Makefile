@@ -18,7 +18,7 @@ demo: install ## simulate a flight and watch its map grow in the browser; Ctrl-C
 	@PYTHON="$(CURDIR)/$(BIN)/python" exec sh deploy/demo.sh
 
 test: install ## run the quick tests
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 test-slow: install ## run the tests that take more than half a minute each
 	$(BIN)/pytest -m slow

@@ -35,7 +35,7 @@ LONGEST = 400
 REASON = re.compile(r"\bone file, because\b")
 """The header of a longer file defends it in these words."""
 
-TOOLS = {"import-linter", "mypy", "pytest-timeout", "ruff", "types-pyyaml"}
+TOOLS = {"import-linter", "mypy", "pytest-timeout", "pytest-xdist", "ruff", "types-pyyaml"}
 READ_BY_OTHERS = {"defusedxml"}
 """Pillow reads XMP only where it is installed."""
 
