@@ -11,18 +11,18 @@ from gnss_scene import BASE_WORLD, broadcast
 
 from air.gnss.gnss_time import SECOND_NS
 from air.odometry.gnss_inertial import GnssInertialPose
-from air.sources.simulated.antenna import carried_antenna, fixed_antenna
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
-from air.sources.simulated.constellation import constellation
 from air.sources.simulated.extrinsics import ExtrinsicsOptions, draw_extrinsics
-from air.sources.simulated.gnss import BASE_STATION, SimulatedReceiver
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.antenna import carried_antenna, fixed_antenna
+from air.sources.simulated.gnss.constellation import constellation
+from air.sources.simulated.gnss.gnss import BASE_STATION, SimulatedReceiver
+from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.gnss.sky import Sky
 from air.sources.simulated.imu import ImuOptions, SimulatedImu
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
-from air.sources.simulated.sky import Sky
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
+from air.sources.simulated.motion.trajectory import Trajectory
 from air.sources.simulated.survey import START_NS
-from air.sources.simulated.trajectory import Trajectory
 from common.arrays import F64
 from common.geo import T_ecef_enu, T_world_other
 from common.measurements import GnssEpoch, ImuSample

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from air.gnss.rinex_export import export_rinex
-from air.sources.simulated.antenna import Antenna, fixed_antenna
-from air.sources.simulated.constellation import constellation
-from air.sources.simulated.gnss import BASE_STATION, ROVER, Observed, SimulatedReceiver
-from air.sources.simulated.gnss_options import GnssOptions
-from air.sources.simulated.observables import Blocked
-from air.sources.simulated.sky import Sky
+from air.sources.simulated.gnss.antenna import Antenna, fixed_antenna
+from air.sources.simulated.gnss.constellation import constellation
+from air.sources.simulated.gnss.gnss import BASE_STATION, ROVER, Observed, SimulatedReceiver
+from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.gnss.observables import Blocked
+from air.sources.simulated.gnss.sky import Sky
 from air.sources.simulated.survey import START_NS
 from common.arrays import F64
 from common.geo import T_ecef_enu

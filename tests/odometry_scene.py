@@ -12,8 +12,8 @@ from air.odometry.tracker import TrackedFrame
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
 from air.sources.simulated.extrinsics import R_BODY_NADIR
 from air.sources.simulated.imu import ImuOptions, SimulatedImu
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
 from common.arrays import F64
 from common.camera import CameraModel
 from common.measurements import ImuSample

@@ -17,7 +17,7 @@ from air.odometry.gnss_inertial import GnssInertial, GnssInertialPose, GnssInert
 from air.odometry.gnss_settings import GnssNoise, GnssSelection, GnssSettings
 from air.odometry.preintegration import ImuBuffer
 from air.odometry.settings import ImuSettings
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from air.sources.source import open_source
 from common.arrays import F64
 from common.geo import T_world_other

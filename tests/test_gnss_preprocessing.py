@@ -18,9 +18,9 @@ from air.gnss.orbit import geometric_range
 from air.gnss.positioning import Refused
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
 from air.odometry.gnss_settings import GnssSelection, GnssSettings
-from air.sources.simulated.antenna import fixed_antenna
-from air.sources.simulated.gnss import BASE_STATION, Observed, SimulatedReceiver
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.antenna import fixed_antenna
+from air.sources.simulated.gnss.gnss import BASE_STATION, Observed, SimulatedReceiver
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.survey import START_NS
 from air.sources.source import open_source
 from common.arrays import F64

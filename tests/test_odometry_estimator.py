@@ -15,7 +15,7 @@ from air.odometry.row_times import ideal_points
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import TrackedFrame
 from air.sources.simulated.imu import ImuOptions
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from common.arrays import F64
 from common.measurements import ImuSample
 from common.messages import Mode

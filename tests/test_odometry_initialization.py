@@ -17,7 +17,7 @@ from air.odometry.preintegration import ImuBuffer
 from air.odometry.settings import ImuSettings, InitializationSettings
 from air.odometry.tracker import TrackedFrame
 from air.sources.simulated.imu import ImuOptions
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from common.gravity import normal_gravity
 from common.measurements import ImuSample
 

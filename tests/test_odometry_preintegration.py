@@ -14,7 +14,7 @@ from odometry_scene import START_NS, Scene
 from air.odometry.preintegration import ImuBuffer, Preintegrator, Propagation
 from air.odometry.settings import ImuSettings
 from air.sources.simulated.imu import ImuOptions
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from common.gravity import normal_gravity
 from common.measurements import ImuSample
 from common.se3 import rotation_angle

@@ -15,7 +15,7 @@ from air.odometry.settings import ImuSettings, WindowSettings
 from air.odometry.tracker import TrackedFrame
 from air.odometry.window import Window
 from air.sources.simulated.imu import ImuOptions
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from common.arrays import F64
 from common.measurements import ImuSample
 

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from air.sources.simulated.camera import Camera, daylight
-from air.sources.simulated.layout import Bounds, Box, House, Layout
-from air.sources.simulated.noise import fractal
-from air.sources.simulated.scene import HOUSE, PLAIN, SOLID, Light, Scene
-from air.sources.simulated.solids import index_solids
+from air.sources.simulated.camera.camera import Camera, daylight
+from air.sources.simulated.sites.layout import Bounds, Box, House, Layout
+from air.sources.simulated.sites.noise import fractal
+from air.sources.simulated.sites.scene import HOUSE, PLAIN, SOLID, Light, Scene
+from air.sources.simulated.sites.solids import index_solids
 from common.camera import CameraModel
 from common.se3 import SE3, rotation_vector_to_matrix
 

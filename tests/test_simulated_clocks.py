@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock, TransportDelay
 from air.sources.simulated.extrinsics import R_BODY_NADIR, ExtrinsicsOptions, draw_extrinsics
-from air.sources.simulated.gauss_markov import GaussMarkov
+from air.sources.simulated.motion.gauss_markov import GaussMarkov
 from common.se3 import rotation_angle
 
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from air.sources.simulated.mission import FlightOptions, Phase, plan
-from air.sources.simulated.multirotor import DRAG, GRAVITY, fly
-from air.sources.simulated.spline import DEGREE, Spline
-from air.sources.simulated.trajectory import Motion, Trajectory
-from air.sources.simulated.wind import gusts, mean_wind, turbulence
+from air.sources.simulated.motion.mission import FlightOptions, Phase, plan
+from air.sources.simulated.motion.multirotor import DRAG, GRAVITY, fly
+from air.sources.simulated.motion.spline import DEGREE, Spline
+from air.sources.simulated.motion.trajectory import Motion, Trajectory
+from air.sources.simulated.motion.wind import gusts, mean_wind, turbulence
 from common.arrays import F64
 from common.config import parse
 from common.errors import ConfigError

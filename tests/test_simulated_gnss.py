@@ -27,11 +27,11 @@ from air.gnss.positioning import PointPosition, find_position
 from air.gnss.settings import PositioningSettings
 from air.gnss.signals import LIGHT
 from air.sensors.gnss_ublox import UbloxReceiver
-from air.sources.simulated.antenna import carried_antenna
-from air.sources.simulated.gnss_options import GnssOptions, intervals
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
-from air.sources.simulated.receiver_clock import ReceiverClock
+from air.sources.simulated.gnss.antenna import carried_antenna
+from air.sources.simulated.gnss.gnss_options import GnssOptions, intervals
+from air.sources.simulated.gnss.receiver_clock import ReceiverClock
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
 from air.sources.simulated.survey import START_NS
 from common.arrays import F64, Bool
 from common.config import parse

@@ -22,7 +22,7 @@ from gnss_scene import (
 
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.rinex_export import export_rinex
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.survey import START_NS
 from air.sources.source import open_source
 from common.errors import ExportError

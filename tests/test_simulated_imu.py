@@ -11,10 +11,10 @@ import pytest
 from air.sensors.imu_xsens import RATE_HZ, TICK_NS, XsensImu
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
 from air.sources.simulated.imu import G, ImuOptions, SimulatedImu
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
-from air.sources.simulated.rotations import exponential, logarithm
-from air.sources.simulated.trajectory import Trajectory
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
+from air.sources.simulated.motion.rotations import exponential, logarithm
+from air.sources.simulated.motion.trajectory import Trajectory
 from common.arrays import F64
 from common.gravity import earth_rate_enu, normal_gravity
 from common.measurements import ImuSample

@@ -11,11 +11,11 @@ from pyproj import Transformer
 from rasterio.transform import from_bounds
 from video_scene import Gliding, camera, fiducial_site
 
-from air.sources.simulated.geotiff import GeotiffOptions, read_site
-from air.sources.simulated.layout import Bounds, Box
-from air.sources.simulated.sites import SITES, WorldOptions, generate_site, texel_of
-from air.sources.simulated.surface import CELL
-from air.sources.simulated.video import CameraOptions
+from air.sources.simulated.camera.video import CameraOptions
+from air.sources.simulated.sites.geotiff import GeotiffOptions, read_site
+from air.sources.simulated.sites.layout import Bounds, Box
+from air.sources.simulated.sites.sites import SITES, WorldOptions, generate_site, texel_of
+from air.sources.simulated.sites.surface import CELL
 from common.errors import SourceError
 from common.geo import geodetic_to_enu
 

@@ -25,8 +25,8 @@ from air.gnss.orbit import EARTH_RATE, states_at
 from air.gnss.positioning import PointPosition, find_position
 from air.gnss.settings import PositioningSettings
 from air.gnss.signals import LIGHT
-from air.sources.simulated.constellation import constellation
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.constellation import constellation
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.survey import START_NS
 from air.sources.source import open_source
 from common.arrays import F64

@@ -9,8 +9,8 @@ import pytest
 
 from air.sensors.mavlink import MavlinkVehicle
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
 from air.sources.simulated.telemetry import MavlinkOptions, SimulatedTelemetry
 from common.counts import Counts
 from common.geo import geodetic_to_enu

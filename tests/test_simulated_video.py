@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from video_scene import Gliding, camera, fiducial_site, project
 
+from air.sources.simulated.camera.video import CameraOptions, Exposure
 from air.sources.simulated.clocks import ClockOptions
-from air.sources.simulated.layout import Box
-from air.sources.simulated.video import CameraOptions, Exposure
+from air.sources.simulated.sites.layout import Box
 from common.measurements import Encoding
 
 PERFECT = CameraOptions.perfect()

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from air.sources.simulated.layout import Bounds
-from air.sources.simulated.scene import DOME, GROUND, HOUSE
-from air.sources.simulated.world import World, generate_world
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.scene import DOME, GROUND, HOUSE
+from air.sources.simulated.sites.world import World, generate_world
 
 BOUNDS = Bounds(-55.0, -50.0, 55.0, 50.0)
 

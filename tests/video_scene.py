@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from air.sources.simulated.baking import fill_levels, periodic_textures
-from air.sources.simulated.camera import daylight
+from air.sources.simulated.camera.camera import daylight
+from air.sources.simulated.camera.video import CameraOptions, Poses, SimulatedCamera, draw_lens
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
 from air.sources.simulated.extrinsics import R_BODY_NADIR
-from air.sources.simulated.layout import Bounds, Box
-from air.sources.simulated.noise import fractal
-from air.sources.simulated.scene import PLAIN
-from air.sources.simulated.site import Site
-from air.sources.simulated.solids import box_solid, solid_table
-from air.sources.simulated.surface import CELL, build_surface, texture_level
-from air.sources.simulated.trajectory import Motion
-from air.sources.simulated.video import CameraOptions, Poses, SimulatedCamera, draw_lens
+from air.sources.simulated.motion.trajectory import Motion
+from air.sources.simulated.sites.baking import fill_levels, periodic_textures
+from air.sources.simulated.sites.layout import Bounds, Box
+from air.sources.simulated.sites.noise import fractal
+from air.sources.simulated.sites.scene import PLAIN
+from air.sources.simulated.sites.site import Site
+from air.sources.simulated.sites.solids import box_solid, solid_table
+from air.sources.simulated.sites.surface import CELL, build_surface, texture_level
 from common.camera import CameraModel
 from common.se3 import SE3, rotation_vector_to_matrix
 

@@ -13,8 +13,8 @@ from figures import Figure, print_table
 from air.sensors.imu_xsens import RATE_HZ, XsensImu
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
 from air.sources.simulated.imu import G, ImuOptions, SimulatedImu
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
 from air.sources.simulated.telemetry import MavlinkOptions, SimulatedTelemetry
 from common.gravity import normal_gravity
 from common.messages import Datum

@@ -27,8 +27,8 @@ from air.gnss.settings import PositioningSettings
 from air.odometry.gnss_inertial import GnssInertial, GnssInertialSettings
 from air.odometry.gnss_settings import GnssNoise, GnssSelection, GnssSettings
 from air.odometry.settings import ImuSettings
-from air.sources.simulated.gnss_options import GnssOptions
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from air.sources.source import open_source
 from common.geo import T_ecef_enu, T_world_other, ecef_to_geodetic
 from common.measurements import GnssEpoch, ImuSample

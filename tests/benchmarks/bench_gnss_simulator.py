@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import rtklib
 from gnss_scene import BASE_ECEF, circling, circling_low, correlation_time, exported, rover
 
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 
 SEEDS = (1, 2, 3)
 DURATION_S = 1200.0

@@ -19,7 +19,7 @@ from odometry_scene import CAMERA, START_NS, T_BODY_CAM, Scene, aligned_rmse
 
 from air.odometry.estimator import Estimate, Estimator
 from air.sources.simulated.imu import ImuOptions
-from air.sources.simulated.mission import FlightOptions
+from air.sources.simulated.motion.mission import FlightOptions
 from air.sources.source import open_source
 from common.export.trajectory import read_tum
 from common.measurements import ImuSample

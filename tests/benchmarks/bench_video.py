@@ -14,14 +14,14 @@ import numpy as np
 from figures import Figure, print_table
 from tqdm import tqdm
 
-from air.sources.simulated import film
+from air.sources.simulated.camera import film
+from air.sources.simulated.camera.video import CameraOptions, Exposure, SimulatedCamera, draw_lens
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
 from air.sources.simulated.extrinsics import ExtrinsicsOptions, draw_extrinsics
-from air.sources.simulated.layout import Bounds
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.multirotor import fly
-from air.sources.simulated.sites import SITES, WorldOptions, generate_site
-from air.sources.simulated.video import CameraOptions, Exposure, SimulatedCamera, draw_lens
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.motion.multirotor import fly
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.sites import SITES, WorldOptions, generate_site
 
 SEED, FLIGHT_S, HALF = 1, 120.0, 100.0
 SURVEY = FlightOptions(start="air")

@@ -18,20 +18,20 @@ from air.sensors.driver import Driver
 from air.sensors.gnss_ublox import UbloxReceiver
 from air.sensors.imu_xsens import XsensImu
 from air.sensors.mavlink import MavlinkVehicle
-from air.sources.simulated.antenna import carried_antenna, fixed_antenna
+from air.sources.simulated.camera.video import SimulatedCamera, draw_lens
 from air.sources.simulated.clocks import Device, DeviceClock, TransportDelay
-from air.sources.simulated.constellation import constellation
 from air.sources.simulated.extrinsics import draw_extrinsics
-from air.sources.simulated.gnss import BASE_STATION, SimulatedReceiver
-from air.sources.simulated.ground import Ground
+from air.sources.simulated.gnss.antenna import carried_antenna, fixed_antenna
+from air.sources.simulated.gnss.constellation import constellation
+from air.sources.simulated.gnss.gnss import BASE_STATION, SimulatedReceiver
+from air.sources.simulated.gnss.sky import Sky
 from air.sources.simulated.imu import SimulatedImu
-from air.sources.simulated.multirotor import fly
+from air.sources.simulated.motion.multirotor import fly
 from air.sources.simulated.options import SimulationOptions
-from air.sources.simulated.site import Site
-from air.sources.simulated.sky import Sky
+from air.sources.simulated.sites.ground import Ground
+from air.sources.simulated.sites.site import Site
 from air.sources.simulated.survey import START_NS
 from air.sources.simulated.telemetry import SimulatedTelemetry
-from air.sources.simulated.video import SimulatedCamera, draw_lens
 from common.arrays import F64
 from common.errors import SourceError
 from common.geo import T_ecef_enu

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from air.sources.simulated.aircraft import Aircraft
-from air.sources.simulated.gnss import Observed
-from air.sources.simulated.site import Site
-from air.sources.simulated.surface import CELL
+from air.sources.simulated.gnss.gnss import Observed
+from air.sources.simulated.sites.site import Site
+from air.sources.simulated.sites.surface import CELL
 from common.errors import ExportError
 from common.export.datum import write_datum
 from common.export.laz import write_points

@@ -11,9 +11,9 @@ from air.sources.known import Known
 from air.sources.live import HOST_TELLS_S, time_only
 from air.sources.simulated.aircraft import Aircraft, Arrival
 from air.sources.simulated.flight_truth import FlightTruth
-from air.sources.simulated.ground import SITES, open_ground
 from air.sources.simulated.known import known_of
 from air.sources.simulated.options import parse_options
+from air.sources.simulated.sites.ground import SITES, open_ground
 from air.sources.source import Problem
 from air.timing import Timebase
 from common.errors import ConfigError, SourceError

@@ -16,10 +16,10 @@ from air.sensors.imu_xsens import RATE_HZ, SELF_TEST, TICK_NS
 from air.sensors.mtdata2 import DataId, Precision, pack
 from air.sensors.xbus import MessageId, frame
 from air.sources.simulated.clocks import DeviceClock
-from air.sources.simulated.gauss_markov import GaussMarkov
-from air.sources.simulated.rotations import exponential, logarithm
-from air.sources.simulated.trajectory import Trajectory
-from air.sources.simulated.vibration import Vibration
+from air.sources.simulated.motion.gauss_markov import GaussMarkov
+from air.sources.simulated.motion.rotations import exponential, logarithm
+from air.sources.simulated.motion.trajectory import Trajectory
+from air.sources.simulated.motion.vibration import Vibration
 from common.arrays import F64, I64, Bool
 from common.config import Range
 from common.gravity import earth_rate_enu, normal_gravity

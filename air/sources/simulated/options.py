@@ -7,15 +7,15 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Annotated, Any, get_type_hints
 from urllib.parse import parse_qsl
 
+from air.sources.simulated.camera.video import CameraOptions
 from air.sources.simulated.clocks import ClockOptions
 from air.sources.simulated.extrinsics import ExtrinsicsOptions
-from air.sources.simulated.geotiff import GeotiffOptions
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.imu import ImuOptions
-from air.sources.simulated.mission import FlightOptions
-from air.sources.simulated.sites import WorldOptions
+from air.sources.simulated.motion.mission import FlightOptions
+from air.sources.simulated.sites.geotiff import GeotiffOptions
+from air.sources.simulated.sites.sites import WorldOptions
 from air.sources.simulated.telemetry import MavlinkOptions
-from air.sources.simulated.video import CameraOptions
 from common.config import Range, parse
 from common.errors import ConfigError, SourceError
 

@@ -9,11 +9,11 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
-from air.sources.simulated.camera import Camera, daylight
-from air.sources.simulated.flight import plan_survey
-from air.sources.simulated.layout import Bounds
+from air.sources.simulated.camera.camera import Camera, daylight
+from air.sources.simulated.motion.flight import plan_survey
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.world import generate_world
 from air.sources.simulated.truth import SurveyTruth
-from air.sources.simulated.world import generate_world
 from air.sources.source import Problem
 from common.camera import CameraModel
 from common.errors import SourceError

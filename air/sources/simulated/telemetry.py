@@ -15,10 +15,10 @@ from typing import Annotated
 import numpy as np
 
 from air.sources.simulated.clocks import DeviceClock
-from air.sources.simulated.gauss_markov import GaussMarkov
-from air.sources.simulated.mission import Mission, Phase
-from air.sources.simulated.rotations import exponential
-from air.sources.simulated.trajectory import Trajectory
+from air.sources.simulated.motion.gauss_markov import GaussMarkov
+from air.sources.simulated.motion.mission import Mission, Phase
+from air.sources.simulated.motion.rotations import exponential
+from air.sources.simulated.motion.trajectory import Trajectory
 from common.arrays import F64
 from common.config import Range
 from common.geo import enu_to_geodetic

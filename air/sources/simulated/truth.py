@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from air.sources.simulated.scene import (
+from air.sources.simulated.sites.scene import (
     DOME_SIDE,
     DOME_TOP,
     EAST_WALL,
@@ -23,7 +23,7 @@ from air.sources.simulated.scene import (
     SOUTH_WALL,
     WEST_WALL,
 )
-from air.sources.simulated.world import World
+from air.sources.simulated.sites.world import World
 from common.arrays import F64, I32, U8, Bool
 from common.camera import CameraModel
 from common.export.datum import write_datum

@@ -13,11 +13,11 @@ from itertools import pairwise
 import numpy as np
 
 from air.gnss.signals import LIGHT
-from air.sources.simulated.antenna import Antenna
-from air.sources.simulated.gnss_options import GnssOptions, Intervals, intervals
-from air.sources.simulated.multipath import Multipath, multipath, multipath_growth
-from air.sources.simulated.receiver_clock import ReceiverClock
-from air.sources.simulated.sky import Air, Sky, l1_squared_over
+from air.sources.simulated.gnss.antenna import Antenna
+from air.sources.simulated.gnss.gnss_options import GnssOptions, Intervals, intervals
+from air.sources.simulated.gnss.multipath import Multipath, multipath, multipath_growth
+from air.sources.simulated.gnss.receiver_clock import ReceiverClock
+from air.sources.simulated.gnss.sky import Air, Sky, l1_squared_over
 from common.arrays import F64, Bool
 from common.geo import T_ecef_enu
 

@@ -13,10 +13,11 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 
-from air.sources.simulated import film, raycast
+from air.sources.simulated.camera import film
 from air.sources.simulated.clocks import DeviceClock
-from air.sources.simulated.site import Site
-from air.sources.simulated.trajectory import Trajectory
+from air.sources.simulated.motion.trajectory import Trajectory
+from air.sources.simulated.sites import raycast
+from air.sources.simulated.sites.site import Site
 from common.arrays import F32, F64, I32, U8
 from common.camera import CameraModel
 from common.config import Range

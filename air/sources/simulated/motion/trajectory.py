@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from air.sources.simulated.spline import Spline
+from air.sources.simulated.motion.spline import Spline
 from common.arrays import F64
 
 POSITION, THRUST, HEADING, ROTORS = slice(0, 3), slice(3, 6), 6, 7

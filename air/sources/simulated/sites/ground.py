@@ -6,12 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from air.sources.simulated.geotiff import read_site
-from air.sources.simulated.layout import Bounds
-from air.sources.simulated.mission import plan
+from air.sources.simulated.motion.mission import plan
 from air.sources.simulated.options import GEOTIFF, PLAIN, SimulationOptions
-from air.sources.simulated.sites import SITES as WORLDS
-from air.sources.simulated.sites import generate_site
+from air.sources.simulated.sites.geotiff import read_site
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.sites import SITES as WORLDS
+from air.sources.simulated.sites.sites import generate_site
 from common.arrays import F64, Bool
 from common.messages import Datum
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from air.sources.simulated.layout import Bounds, Tree
-from air.sources.simulated.noise import periodic_detail
-from air.sources.simulated.surface import CELL
+from air.sources.simulated.sites.layout import Bounds, Tree
+from air.sources.simulated.sites.noise import periodic_detail
+from air.sources.simulated.sites.surface import CELL
 from common.arrays import F32, F64, U8
 
 _LUMPS = 256

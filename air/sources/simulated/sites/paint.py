@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from air.sources.simulated.layout import Box, Layout, Road
-from air.sources.simulated.noise import fractal, smoothstep
+from air.sources.simulated.sites.layout import Box, Layout, Road
+from air.sources.simulated.sites.noise import fractal, smoothstep
 from common.arrays import F64, I32, U8
 
 COARSE_CELL = 0.2

@@ -9,13 +9,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from air.sources.simulated.layout import Bounds, Box, Layout, Road, Tree, plan_village
-from air.sources.simulated.noise import fractal, smoothstep
-from air.sources.simulated.paint import SOIL, Canvas, meadow, paint_ground
-from air.sources.simulated.plants import Plants, scatter_trees
-from air.sources.simulated.scene import FACADE, PLASTER, TILES, Solids
-from air.sources.simulated.solids import ROOFS, box_solid, build_solids, solid_table
-from air.sources.simulated.surface import CELL
+from air.sources.simulated.sites.layout import Bounds, Box, Layout, Road, Tree, plan_village
+from air.sources.simulated.sites.noise import fractal, smoothstep
+from air.sources.simulated.sites.paint import SOIL, Canvas, meadow, paint_ground
+from air.sources.simulated.sites.plants import Plants, scatter_trees
+from air.sources.simulated.sites.scene import FACADE, PLASTER, TILES, Solids
+from air.sources.simulated.sites.solids import ROOFS, box_solid, build_solids, solid_table
+from air.sources.simulated.sites.surface import CELL
 from common.arrays import F32, F64, U8
 
 TERRAIN_CELL = 1.0

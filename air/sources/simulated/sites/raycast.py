@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from air.sources.simulated.raytrace import compiled, enter_house
-from air.sources.simulated.scene import EAST_WALL, GROUND, NORTH_ROOF, NORTH_WALL, SOUTH_ROOF, WEST_WALL, Light
-from air.sources.simulated.surface import (
+from air.sources.simulated.sites.raytrace import compiled, enter_house
+from air.sources.simulated.sites.scene import EAST_WALL, GROUND, NORTH_ROOF, NORTH_WALL, SOUTH_ROOF, WEST_WALL, Light
+from air.sources.simulated.sites.surface import (
     CELL,
     DETAIL_MIPS,
     DETAIL_TEXEL,

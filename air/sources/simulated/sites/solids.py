@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from air.sources.simulated.layout import Bounds, Box, Layout, Tree
-from air.sources.simulated.scene import DOME, HOUSE, PLAIN, PLASTER, RIBS, SOLID, TILES, Solids
+from air.sources.simulated.sites.layout import Bounds, Box, Layout, Tree
+from air.sources.simulated.sites.scene import DOME, HOUSE, PLAIN, PLASTER, RIBS, SOLID, TILES, Solids
 from common.arrays import F64, I32
 
 Ground = Callable[[float, float], float]

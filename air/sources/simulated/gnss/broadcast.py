@@ -13,7 +13,7 @@ from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
 from air.gnss.gnss_time import BDT_MINUS_GPST_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
 from air.gnss.orbit import is_geostationary
 from air.sensors.ubx_messages import NavigationBits
-from air.sources.simulated.constellation import Constellation
+from air.sources.simulated.gnss.constellation import Constellation
 from common.measurements import GlonassEphemeris, KeplerEphemeris
 
 _FRAME_NS = 30 * SECOND_NS

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from air.sources.simulated.trajectory import Trajectory
+from air.sources.simulated.motion.trajectory import Trajectory
 from common.arrays import F64
 from common.geo import T_ecef_enu
 from common.messages import Datum

@@ -8,8 +8,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from air.sources.simulated import raytrace
-from air.sources.simulated.scene import Light, Scene
+from air.sources.simulated.sites import raytrace
+from air.sources.simulated.sites.scene import Light, Scene
 from common.arrays import F32, F64, I32, U8
 from common.camera import CameraModel
 from common.se3 import SE3

@@ -8,12 +8,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from air.sources.simulated.landscape import Landscape, at, ground
-from air.sources.simulated.layout import Bounds, Box, Layout, Tree
-from air.sources.simulated.paint import ASPHALT, CRACK, GRASS, SOIL, Canvas, meadow
-from air.sources.simulated.plants import Plants, scatter_trees
-from air.sources.simulated.scene import CONCRETE, FACADE, PLAIN, PLASTER, RIBS
-from air.sources.simulated.solids import CARS, CONTAINERS, GLASS, Solid, box_solid, solid_table
+from air.sources.simulated.sites.landscape import Landscape, at, ground
+from air.sources.simulated.sites.layout import Bounds, Box, Layout, Tree
+from air.sources.simulated.sites.paint import ASPHALT, CRACK, GRASS, SOIL, Canvas, meadow
+from air.sources.simulated.sites.plants import Plants, scatter_trees
+from air.sources.simulated.sites.scene import CONCRETE, FACADE, PLAIN, PLASTER, RIBS
+from air.sources.simulated.sites.solids import CARS, CONTAINERS, GLASS, Solid, box_solid, solid_table
 from common.arrays import F64
 
 Colour = tuple[int, int, int]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from air.sources.simulated.noise import periodic_detail
-from air.sources.simulated.raytrace import compiled
-from air.sources.simulated.scene import CONCRETE, FACADE, PLAIN, PLASTER, RIBS, TILES, Light
-from air.sources.simulated.surface import (
+from air.sources.simulated.sites.noise import periodic_detail
+from air.sources.simulated.sites.raytrace import compiled
+from air.sources.simulated.sites.scene import CONCRETE, FACADE, PLAIN, PLASTER, RIBS, TILES, Light
+from air.sources.simulated.sites.surface import (
     CELL,
     DETAIL_MIPS,
     DETAIL_TEXELS,

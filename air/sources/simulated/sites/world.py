@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from air.sources.simulated import raytrace
-from air.sources.simulated.layout import Bounds, Layout, plan_village
-from air.sources.simulated.noise import fractal, periodic_detail, smoothstep
-from air.sources.simulated.paint import paint_ground
-from air.sources.simulated.scene import Scene
-from air.sources.simulated.solids import build_solids, index_solids
+from air.sources.simulated.sites import raytrace
+from air.sources.simulated.sites.layout import Bounds, Layout, plan_village
+from air.sources.simulated.sites.noise import fractal, periodic_detail, smoothstep
+from air.sources.simulated.sites.paint import paint_ground
+from air.sources.simulated.sites.scene import Scene
+from air.sources.simulated.sites.solids import build_solids, index_solids
 from common.arrays import F32, F64, I32, U8
 
 TERRAIN_CELL, PAINT_CELL, INDEX_CELL = 1.0, 0.05, 2.0

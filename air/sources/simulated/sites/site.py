@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from air.sources.simulated import raycast
-from air.sources.simulated.layout import Bounds
-from air.sources.simulated.scene import Light
-from air.sources.simulated.surface import LIGHT_SCALE, Surface, rasterize, texture_level
+from air.sources.simulated.sites import raycast
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.scene import Light
+from air.sources.simulated.sites.surface import LIGHT_SCALE, Surface, rasterize, texture_level
 from common.arrays import F32, F64, I32, U8, Bool
 
 _DSM_ROWS = 256

@@ -7,16 +7,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from air.sources.simulated.baking import bake, periodic_textures
-from air.sources.simulated.camera import daylight
-from air.sources.simulated.landscape import Landscape, field, forest, town
-from air.sources.simulated.layout import Bounds, Box
-from air.sources.simulated.noise import periodic_detail
-from air.sources.simulated.playground import playground
-from air.sources.simulated.scene import PLAIN, Solids
-from air.sources.simulated.site import Mover, Site
-from air.sources.simulated.solids import CARS, GLASS, box_solid, solid_table
-from air.sources.simulated.surface import build_surface, texture_level
+from air.sources.simulated.camera.camera import daylight
+from air.sources.simulated.sites.baking import bake, periodic_textures
+from air.sources.simulated.sites.landscape import Landscape, field, forest, town
+from air.sources.simulated.sites.layout import Bounds, Box
+from air.sources.simulated.sites.noise import periodic_detail
+from air.sources.simulated.sites.playground import playground
+from air.sources.simulated.sites.scene import PLAIN, Solids
+from air.sources.simulated.sites.site import Mover, Site
+from air.sources.simulated.sites.solids import CARS, GLASS, box_solid, solid_table
+from air.sources.simulated.sites.surface import build_surface, texture_level
 from common.config import Range
 
 SITES = {"playground": playground, "town": town, "field": field, "forest": forest}

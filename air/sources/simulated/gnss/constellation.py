@@ -19,8 +19,8 @@ from air.gnss.ephemerides import is_healthy
 from air.gnss.gnss_time import BEIDOU_EPOCH_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
 from air.gnss.orbit import MU, RATE, is_geostationary, states_at
 from air.sources.rinex import open_rinex
-from air.sources.simulated.gnss_options import GnssOptions
-from air.sources.simulated.nominal_orbits import nominal, wrapped
+from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.gnss.nominal_orbits import nominal, wrapped
 from common.errors import SourceError
 from common.measurements import Ephemeris, GlonassEphemeris, Ionosphere, KeplerEphemeris
 

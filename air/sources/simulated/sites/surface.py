@@ -10,9 +10,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from air.sources.simulated.layout import Bounds
-from air.sources.simulated.scene import Light, Solids
-from air.sources.simulated.solids import index_solids
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.scene import Light, Solids
+from air.sources.simulated.sites.solids import index_solids
 from common.arrays import F32, F64, I32, U8, U32
 
 CELL = 0.125

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from air.sources.simulated.raytrace import compiled
+from air.sources.simulated.sites.raytrace import compiled
 from common.arrays import F32, F64, I64, U8
 
 GROUP = 16

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from common.arrays import F64
 
 FADING_DB = 1.0

@@ -17,8 +17,8 @@ from air.gnss.orbit import EARTH_RATE, states_at
 from air.gnss.positioning import azimuth_elevation
 from air.gnss.ranges import group_delay
 from air.gnss.signals import LIGHT, frequency
-from air.sources.simulated.constellation import Constellation
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.constellation import Constellation
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from common.arrays import F64
 from common.geo import ecef_to_geodetic, geodetic_to_ecef
 from common.measurements import GlonassEphemeris

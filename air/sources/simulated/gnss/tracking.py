@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from air.sources.simulated.gnss_options import GnssOptions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from common.arrays import F64, Bool
 
 ACQUIRE_CN0, CODE_CN0, CARRIER_CN0 = 28.0, 22.0, 26.0

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from air.sources.simulated.mission import FlightOptions, Mission, Reference, plan
-from air.sources.simulated.spline import Spline
-from air.sources.simulated.trajectory import CHANNELS, HEADING, POSITION, ROTORS, THRUST, Trajectory
-from air.sources.simulated.wind import gusts, mean_wind, turbulence
+from air.sources.simulated.motion.mission import FlightOptions, Mission, Reference, plan
+from air.sources.simulated.motion.spline import Spline
+from air.sources.simulated.motion.trajectory import CHANNELS, HEADING, POSITION, ROTORS, THRUST, Trajectory
+from air.sources.simulated.motion.wind import gusts, mean_wind, turbulence
 from common.arrays import F64
 
 STEP_S = 0.02

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba import njit
 
-from air.sources.simulated.scene import (
+from air.sources.simulated.sites.scene import (
     DOME,
     DOME_SIDE,
     DOME_TOP,

@@ -14,13 +14,13 @@ from air.sensors import ubx
 from air.sensors.ubx_messages import NAV_PVT, RXM_RAWX, RXM_SFRBX, pack_sfrbx
 from air.sensors.ubx_pvt import pack_pvt
 from air.sensors.ubx_rawx import pack_rawx, parse_rawx
-from air.sources.simulated.antenna import Antenna
-from air.sources.simulated.broadcast import Broadcast, Piece
-from air.sources.simulated.gnss_options import GnssOptions
-from air.sources.simulated.observables import TRACKING, Blocked, Observables, Observer
-from air.sources.simulated.own_solution import OwnSolution
-from air.sources.simulated.sky import Sky
-from air.sources.simulated.tracking import Tracked, Tracking
+from air.sources.simulated.gnss.antenna import Antenna
+from air.sources.simulated.gnss.broadcast import Broadcast, Piece
+from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.gnss.observables import TRACKING, Blocked, Observables, Observer
+from air.sources.simulated.gnss.own_solution import OwnSolution
+from air.sources.simulated.gnss.sky import Sky
+from air.sources.simulated.gnss.tracking import Tracked, Tracking
 from common.arrays import F64
 from common.measurements import GnssEpoch
 

@@ -15,13 +15,13 @@ from rasterio.fill import fillnodata
 from rasterio.io import DatasetReader
 from rasterio.warp import transform_bounds
 
-from air.sources.simulated.baking import fill_levels, periodic_textures
-from air.sources.simulated.camera import daylight
-from air.sources.simulated.layout import Bounds
-from air.sources.simulated.site import Site
-from air.sources.simulated.sites import texel_of
-from air.sources.simulated.solids import solid_table
-from air.sources.simulated.surface import CELL, LIGHT_SCALE, build_surface, texture_level
+from air.sources.simulated.camera.camera import daylight
+from air.sources.simulated.sites.baking import fill_levels, periodic_textures
+from air.sources.simulated.sites.layout import Bounds
+from air.sources.simulated.sites.site import Site
+from air.sources.simulated.sites.sites import texel_of
+from air.sources.simulated.sites.solids import solid_table
+from air.sources.simulated.sites.surface import CELL, LIGHT_SCALE, build_surface, texture_level
 from common.arrays import F32, U8
 from common.config import Range
 from common.errors import SourceError

@@ -1,0 +1,1 @@
+"""What the cameras make of it: photos and rolling-shutter video."""

@@ -1,0 +1,1 @@
+"""Satellites, air and receivers: what a GNSS receiver sends."""

@@ -1,0 +1,1 @@
+"""How the aircraft moves: missions, wind, and one smooth trajectory."""
