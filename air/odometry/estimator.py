@@ -26,6 +26,8 @@ from common.se3 import SE3
 
 AGAIN = Sigmas(tilt=0.02, yaw=0.02, position=0.5, velocity=0.5, accel_bias=0.05, gyro_bias=0.005)
 """How well the IMU's prediction is known where the window starts anew."""
+JOINED = np.diag([1e-3, 1e-3, 1e-3, 1e-4]) ** 2
+"""Of where what began anew is placed: the world is where that is."""
 HALF_GYRO_NS = 10_000_000
 RETRY_S = 5.0
 
@@ -125,7 +127,7 @@ class Estimator:
             return initial
         window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
         first = initial.states[0]
-        window.begin(first, initial.sigmas, self._points_at(initial.frames[0], first, {}, initial.depth))
+        window.begin(first, initial.sigmas.covariance(first.T_world_body.R), self._points_at(initial.frames[0], first, {}, initial.depth))
         for state, seen in list(zip(initial.states, initial.frames, strict=True))[1:]:
             window.add(seen.t_ns, self._points_at(seen, state, {}, initial.depth), state)
         solution = Solution(0.0, 0, 0)
@@ -158,7 +160,7 @@ class Estimator:
 
     def _join(self, window: Window, before: InertialState) -> None:
         """Place what began anew where the IMU says that the aircraft is."""
-        window.move(_level_between(window.state().T_world_body, before.T_world_body))
+        window.move(_level_between(window.state().T_world_body, before.T_world_body), JOINED)
         self.revision += 1
 
     def _continue(self, window: Window, frame: TrackedFrame) -> Estimate | Refusal:
@@ -239,7 +241,7 @@ class Estimator:
             self._window, self._initialization = None, self._new_initialization()
             return Refusal(f"begins anew, because {why}")
         state = self._plausible(predicted)
-        window.begin(state, AGAIN, self._points_at(frame, state, {}, np.inf))
+        window.begin(state, AGAIN.covariance(state.T_world_body.R), self._points_at(frame, state, {}, np.inf))
         self._propagate_from(state)
         return self._estimate(window, Solution(0.0, 0, 0), note=f"window started anew: {why}")
 

@@ -1,18 +1,16 @@
-"""What is known of the first state in a window, as factors."""
+"""What is known of the first state in a window."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from air.odometry.preintegration import InertialState, to_pose3
+from air.odometry.quadratic import Quadratic
 from air.odometry.settings import ImuSettings
 from common.arrays import F64
-
-noise = gtsam.noiseModel
 
 
 @dataclass(frozen=True)
@@ -26,21 +24,20 @@ class Sigmas:
     accel_bias: float
     gyro_bias: float
 
+    def covariance(self, R_world_body: F64) -> F64:
+        """Covariance (15, 15) of rotation and position in body axes, velocity, biases."""
+        squares = np.repeat([self.position, self.velocity, self.accel_bias, self.gyro_bias], 3) ** 2
+        out = np.diag([0.0, 0.0, 0.0, *squares])
+        # gtsam's tangent turns about body axes: tilt and yaw are seen from there
+        out[:3, :3] = R_world_body.T @ np.diag(np.square([self.tilt, self.tilt, self.yaw])) @ R_world_body
+        return out
 
-def initial_prior(
-    k: int, state: InertialState, sigmas: Sigmas, imu: ImuSettings
-) -> tuple[gtsam.NonlinearFactorGraph, F64]:
-    """Factors on the state of frame k, and the covariance (6, 6) of its pose: rotation and position in body axes."""
-    s = sigmas
-    axes = state.T_world_body.R.T  # gtsam's tangent turns about body axes: tilt and yaw are seen from there
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = axes @ np.diag([s.tilt**2, s.tilt**2, s.yaw**2]) @ axes.T
-    covariance[3:, 3:] = np.eye(3) * s.position**2
-    prior = gtsam.NonlinearFactorGraph()
-    prior.add(gtsam.PriorFactorPose3(X(k), to_pose3(state.T_world_body), noise.Gaussian.Covariance(covariance)))
-    prior.add(gtsam.PriorFactorVector(V(k), state.v_world, noise.Isotropic.Sigma(3, s.velocity)))
-    bias = noise.Diagonal.Sigmas(np.repeat([s.accel_bias, s.gyro_bias], 3))
-    prior.add(gtsam.PriorFactorConstantBias(B(k), state.bias, bias))
-    made = noise.Diagonal.Sigmas(np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3))
-    prior.add(gtsam.PriorFactorConstantBias(B(k), gtsam.imuBias.ConstantBias(), made))
-    return prior, covariance
+
+def initial_prior(k: int, state: InertialState, covariance: F64, imu: ImuSettings) -> Quadratic:
+    """The state of frame k, known within a covariance (15, 15); its biases are also those that such a device has."""
+    point = {X(k): to_pose3(state.T_world_body), V(k): state.v_world, B(k): state.bias.vector()}
+    G, g = np.linalg.inv(covariance), np.zeros(15)
+    made = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3) ** -2.0
+    G[9:, 9:] += np.diag(made)
+    g[9:] -= made * state.bias.vector()
+    return Quadratic(point, G, g)

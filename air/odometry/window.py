@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
-from air.odometry.initial_prior import Sigmas, initial_prior
+from air.odometry.initial_prior import initial_prior
 from air.odometry.landmarks import View, locate, outliers, rms_px
-from air.odometry.marginalization import marginalize
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
+from air.odometry.quadratic import NormalEquations, Quadratic, carried, dimension, variable
 from air.odometry.settings import ImuSettings, WindowSettings
 from common.arrays import F64
 from common.se3 import SE3
@@ -57,17 +57,17 @@ class Solution:
 
 
 class Companion(Protocol):
-    """Somebody with more factors in the window, such as GNSS.
+    """Somebody who knows more about the frames in the window, such as GNSS.
 
-    It keeps values of its own keys in `window.values`; all of them appear in its factors.
+    It keeps values of its own keys in `window.values`.
     """
 
-    def factors(self, window: Window) -> gtsam.NonlinearFactorGraph:
-        """The factors at the frames that the window holds now."""
+    def terms(self, window: Window) -> list[Quadratic]:
+        """What it knows about the frames that the window holds now."""
         ...
 
-    def leaving(self, window: Window, k: int) -> list[int]:
-        """Own keys that leave with frame k; they are erased from the window's values thereafter."""
+    def leaving(self, window: Window, k: int) -> tuple[list[int], list[Quadratic]]:
+        """Own keys that leave with frame k, and all that it knows about them and that frame."""
         ...
 
 
@@ -85,7 +85,7 @@ class Window:
         self.points: set[int] = set()
         self.companion: Companion | None = None
         self._anchored: set[int] = set()
-        self._prior = gtsam.NonlinearFactorGraph()
+        self._prior: Quadratic | None = None
         self._covariance = np.eye(6)
         self._calibration = gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
         self._pose_of_camera = to_pose3(T_body_cam)
@@ -121,14 +121,13 @@ class Window:
 
     # Frames
 
-    def begin(self, state: InertialState, sigmas: Sigmas, xy: dict[int, F64]) -> None:
-        """Start anew from a first frame whose state is known."""
+    def begin(self, state: InertialState, covariance: F64, xy: dict[int, F64]) -> None:
+        """Start anew from a first frame whose state is known within a covariance (15, 15), as `Sigmas` have it."""
         k = self.frames[-1].k + 1 if self.frames else 0
         self.values, self.frames, self.points, self._anchored = gtsam.Values(), [], set(), set()
         self._insert(k, state)
         self.frames.append(Frame(k, state.t_ns, xy))
-        self._sigmas = sigmas
-        self._prior, self._covariance = initial_prior(k, state, sigmas, self._imu_settings)
+        self._prior, self._covariance = initial_prior(k, state, covariance, self._imu_settings), covariance[:6, :6]
 
     def predict(self, t_ns: int) -> InertialState:
         """Where the newest state leads to by the IMU."""
@@ -199,6 +198,8 @@ class Window:
             except RuntimeError as error:  # gtsam names an undetermined variable
                 if not self._remove_named(str(error)):
                     return Solution(np.inf, len(self.points), 0, failed=True)
+            except np.linalg.LinAlgError:
+                return Solution(np.inf, len(self.points), 0, failed=True)
         else:
             return Solution(np.inf, len(self.points), 0, failed=True)
         self._reintegrate()
@@ -214,15 +215,12 @@ class Window:
                 break
         return solution
 
-    def move(self, T_new_world: SE3) -> None:
-        """Turn everything about the vertical and shift it; nothing has been marginalized so far."""
-        pose, R = to_pose3(T_new_world), T_new_world.R
-        for frame in self.frames:
-            self.values.update(X(frame.k), pose.compose(self.values.atPose3(X(frame.k))))
-            self.values.update(V(frame.k), R @ self.values.atVector(V(frame.k)))
-        for i, p_world in self.positions().items():
-            self.values.update(L(i), T_new_world.apply(p_world))
-        self._prior, _ = initial_prior(self.frames[0].k, self.state(0), self._sigmas, self._imu_settings)
+    def move(self, T_new_world: SE3, covariance: F64) -> None:
+        """Turn everything about the vertical and shift it; `covariance` (4, 4) is of the shift m and the turn rad."""
+        assert self._prior is not None
+        self._prior = self._prior.carried(T_new_world, covariance)
+        for key in [key for f in self.frames for key in (X(f.k), V(f.k))] + [L(i) for i in self.points]:
+            self.values.update(key, carried(key, variable(self.values, key), T_new_world))
 
     def _remove_named(self, error: str) -> bool:
         named = re.search(r"Symbol: l(\d+)", error)
@@ -233,36 +231,50 @@ class Window:
 
     def _gauss_newton(self) -> int:
         """Iterations that it took."""
-        graph, ordering = self._graph(), self._ordering()
-        values, error = self.values, graph.error(self.values)
+        graph, linear = self._graph(), self._known()
+        values, error = self.values, _error(graph, linear, self.values)
         iterations = 0
         while iterations < self._settings.iterations:
             iterations += 1
-            net = graph.linearize(values).eliminateSequential(ordering)
-            new = values.retract(net.optimize())
-            new_error = graph.error(new)
+            change, covariance = self._step(graph, [known.at(values) for known in linear], values)
+            new = values.retract(change)
+            new_error = _error(graph, linear, new)
             if not np.isfinite(new_error) or new_error > error:
                 break
+            self._covariance = covariance
             improved, values, error = error - new_error, new, new_error
             if improved < TOLERANCE * error:
                 break
         self.values = values
-        R = net.at(net.size() - 1).R()  # the newest pose is eliminated last: its conditional is its marginal
-        inverse = np.linalg.inv(R)
-        self._covariance = inverse @ inverse.T
         return iterations
 
+    def _step(
+        self, graph: gtsam.NonlinearFactorGraph, linear: list[Quadratic], values: gtsam.Values
+    ) -> tuple[gtsam.VectorValues, F64]:
+        """The change of all values, and the covariance of the newest pose; points are eliminated first."""
+        points = gtsam.Ordering([L(i) for i in sorted(self.points - self._anchored)])
+        net, rest = graph.linearize(values).eliminatePartialSequential(points)
+        equations = _equations(rest, linear, values)
+        change, covariance = equations.solve([X(self.frames[-1].k)])
+        moved = gtsam.VectorValues()
+        for key, delta in change.items():
+            moved.insert(key, delta)
+        return net.optimize(moved), covariance
+
+    def _known(self) -> list[Quadratic]:
+        """What is known beside the factors that gtsam knows."""
+        assert self._prior is not None
+        return [self._prior, *(self.companion.terms(self) if self.companion is not None else [])]
+
     def _graph(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph(self._prior)
+        graph = gtsam.NonlinearFactorGraph()
         for last, frame in zip(self.frames, self.frames[1:], strict=False):
             self._add_motion(graph, last, frame)
         for frame in self.frames:
             for factor in frame.factors.values():
                 graph.add(factor)
-        for i, p_world in self.positions().items():
-            graph.add(gtsam.PriorFactorPoint3(L(i), p_world, self._weak(p_world)))
-        if self.companion is not None:
-            graph.push_back(self.companion.factors(self))
+        for i in sorted(self.points):
+            graph.add(self._weak(i))
         return graph
 
     def _add_motion(self, graph: gtsam.NonlinearFactorGraph, a: Frame, b: Frame) -> None:
@@ -272,18 +284,11 @@ class Window:
             stay = noise.Diagonal.Sigmas(np.repeat([STILL_TURN, STILL_SHIFT], 3))
             graph.add(gtsam.BetweenFactorPose3(X(a.k), X(b.k), gtsam.Pose3(), stay))
 
-    def _weak(self, p_world: F64) -> gtsam.noiseModel.Base:
+    def _weak(self, i: int) -> gtsam.NonlinearFactor:
         """So little that it only keeps the system regular: many such priors together must not hold the scale."""
+        p_world = self.values.atPoint3(L(i))
         distance = float(np.linalg.norm(p_world - self.values.atPose3(X(self.frames[-1].k)).translation()))
-        return noise.Isotropic.Sigma(3, WEAK * max(distance, 1e-3))
-
-    def _ordering(self) -> gtsam.Ordering:
-        """Points first, then a companion's keys, then the frames; the newest pose last."""
-        known = [L(i) for i in sorted(self.points - self._anchored)] + [L(i) for i in sorted(self._anchored)]
-        frames = [key for f in self.frames for key in (V(f.k), B(f.k), X(f.k))]
-        mine = {*known, *frames}
-        others = [key for key in self.values.keys() if key not in mine]  # noqa: SIM118
-        return gtsam.Ordering([*known, *others, *frames])
+        return gtsam.PriorFactorPoint3(L(i), p_world, noise.Isotropic.Sigma(3, WEAK * max(distance, 1e-3)))
 
     def _reintegrate(self) -> None:
         """Integrate the IMU again where the bias moved too far."""
@@ -357,16 +362,36 @@ class Window:
         for i in oldest.factors.keys() - kept - set(gone):  # its other observations count later, with the next oldest
             del oldest.factors[i], oldest.xy[i]
         self._drop_lonely()
-        others = self.companion.leaving(self, oldest.k) if self.companion is not None else []
-        frame_keys = [*others, V(oldest.k), B(oldest.k), X(oldest.k)]
-        self._prior = marginalize(self._graph(), self.values, [*(L(i) for i in gone), *frame_keys])
+        leaving = [*(L(i) for i in gone if i in self._anchored), V(oldest.k), B(oldest.k), X(oldest.k)]
+        known = [self._prior]
+        if self.companion is not None:
+            others, more = self.companion.leaving(self, oldest.k)
+            leaving, known = [*others, *leaving], [*known, *more]
+        points = gtsam.Ordering([L(i) for i in gone if i not in self._anchored])
+        linear = self._graph_of(oldest, gone).linearize(self.values)
+        rest = linear.eliminatePartialSequential(points)[1]
+        at_values = [one.at(self.values) for one in known if one is not None]
+        self._prior = _equations(rest, at_values, self.values).without(leaving, self.values)
         self._anchored = kept
         for i in gone:
             self._forget(i)
-        for key in frame_keys:
-            self.values.erase(key)
+        for key in leaving:
+            if self.values.exists(key):
+                self.values.erase(key)
         self.frames.pop(0)
         self._imu.forget(self.frames[0].t_ns)
+
+    def _graph_of(self, oldest: Frame, gone: list[int]) -> gtsam.NonlinearFactorGraph:
+        """The factors of the oldest frame, and of points that leave with it."""
+        graph, leaving = gtsam.NonlinearFactorGraph(), set(gone)
+        self._add_motion(graph, oldest, self.frames[1])
+        for i in gone:
+            graph.add(self._weak(i))
+        for frame in self.frames:
+            for i, factor in frame.factors.items():
+                if frame is oldest or i in leaving:
+                    graph.add(factor)
+        return graph
 
     def _to_anchor(self, oldest: Frame, ended: set[int]) -> set[int]:
         """Points that stay, with what the oldest frame knew of them: those in the prior, and the longest seen."""
@@ -374,3 +399,22 @@ class Window:
         rivals = sorted((oldest.factors.keys() & self.points) - ended - already)
         rivals.sort(key=lambda i: -sum(i in frame.factors for frame in self.frames))
         return already | set(rivals[: max(0, self._settings.anchored - len(already))])
+
+
+def _equations(rest: gtsam.GaussianFactorGraph, linear: list[Quadratic], values: gtsam.Values) -> NormalEquations:
+    """The sum of gtsam's linear factors and of what else is known."""
+    keys = {key: None for key in sorted(rest.keyVector())}
+    for known in linear:
+        keys |= dict.fromkeys(known.point)
+    equations = NormalEquations({key: dimension(values, key) for key in keys})
+    mine = rest.keyVector()
+    if mine:
+        G, g = rest.hessian(gtsam.Ordering(mine))
+        equations.add(mine, G, g)
+    for known in linear:
+        equations.add(known.point, known.G, known.g)
+    return equations
+
+
+def _error(graph: gtsam.NonlinearFactorGraph, linear: list[Quadratic], values: gtsam.Values) -> float:
+    return float(graph.error(values)) + sum(known.error(values) for known in linear)
