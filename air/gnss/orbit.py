@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from operator import attrgetter
 
 import numpy as np
@@ -187,18 +188,25 @@ def _geo_to_ecef(position: F64, velocity: F64, rate: F64, tk: F64) -> tuple[F64,
 
 def _glonass(ephemerides: Sequence[GlonassEphemeris], t_ns: int, offset_s: F64) -> F64:
     """Rows (N, 8) of position, velocity, clock and drift of integrated GLONASS states."""
-    state = np.array([(*ephemeris.position, *ephemeris.velocity) for ephemeris in ephemerides], float)
     pull = np.array([ephemeris.acceleration for ephemeris in ephemerides], float)
     tau, gamma = np.array([(ephemeris.tau, ephemeris.gamma) for ephemeris in ephemerides], float).T
     toe_ns = np.array([ephemeris.toe_ns for ephemeris in ephemerides], np.int64)
     t = (t_ns - toe_ns) * 1e-9 + offset_s
-    left = np.where(np.abs(t) <= _GLONASS_REACH_S, t, np.nan)
-    while np.any(np.abs(left) > 1e-9):
-        step = np.clip(left, -_GLONASS_STEP_S, _GLONASS_STEP_S)
-        state = _runge_kutta(state, pull, step[:, None])
-        left = left - step
-    state[np.isnan(left)] = np.nan
-    return np.column_stack([state, tau + gamma * t, gamma])
+    within = np.abs(t) <= _GLONASS_REACH_S
+    steps = np.where(within, np.trunc(t / _GLONASS_STEP_S), 0.0)
+    state = np.array([_glonass_state(*of) for of in zip(ephemerides, steps.astype(int).tolist(), strict=True)])
+    left = np.where(within, t - steps * _GLONASS_STEP_S, np.nan)
+    return np.column_stack([_runge_kutta(state, pull, left[:, None]), tau + gamma * t, gamma])
+
+
+@lru_cache(4096)
+def _glonass_state(ephemeris: GlonassEphemeris, steps: int) -> tuple[float, ...]:
+    """Position and velocity (6,) whole steps after an ephemeris' reference time, or before it."""
+    if steps == 0:
+        return *ephemeris.position, *ephemeris.velocity
+    way = 1 if steps > 0 else -1
+    state, pull = np.array([_glonass_state(ephemeris, steps - way)]), np.array([ephemeris.acceleration])
+    return tuple(_runge_kutta(state, pull, np.full((1, 1), way * _GLONASS_STEP_S))[0].tolist())
 
 
 def _runge_kutta(state: F64, pull: F64, step: F64) -> F64:
