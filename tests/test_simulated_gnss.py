@@ -282,6 +282,19 @@ def test_the_receivers_own_solution_follows_the_flight() -> None:
     assert np.sqrt(np.mean(np.square(speed_errors), axis=0)).max() < 0.3
 
 
+def test_the_receivers_own_position_is_of_the_one_and_a_half_metre_class_from_the_first_fix() -> None:
+    """The median of horizontal errors is what such receivers are named by; heights are 1.7 times as uncertain."""
+    errors = []
+    for seed in range(1, 6):
+        first = next(iter(solutions(decoded(rover(DEFAULT, 1.0, seed).packets()))))
+        p_world = geodetic_to_enu(DATUM, first.latitude_deg, first.longitude_deg, first.height)
+        truth, _ = circling(np.array([(first.t_ns - START_NS) / SECOND_NS]))
+        errors.append(p_world - T_ECEF_WORLD.inverse().apply(truth[0]))
+    east, north, up = np.array(errors).T
+    assert np.median(np.hypot(east, north)) < 1.5
+    assert np.sqrt(np.mean(up**2)) < 1.7 * 1.5
+
+
 def test_an_antenna_moves_as_the_body_turns() -> None:
     trajectory, _ = fly(FlightOptions(), 1, 60.0, np.zeros(3))
     antenna = carried_antenna(trajectory, np.array([0.5, -0.3, 0.2]), DATUM)

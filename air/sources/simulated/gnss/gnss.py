@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.gnss.observables import TRACKING, Blocked, Observables, Observer
 from air.sources.simulated.gnss.own_solution import OwnSolution
 from air.sources.simulated.gnss.sky import Sky
-from air.sources.simulated.gnss.tracking import Tracked, Tracking
+from air.sources.simulated.gnss.tracking import WARM_S, Tracked, Tracking
 from common.arrays import F64
 from common.measurements import GnssEpoch
 
@@ -29,6 +29,7 @@ ROVER, BASE_STATION = 54, 61
 _PROCESSING_S, _SOLVING_S = 0.03, 0.01
 """From the epoch to its raw measurements, and from these to the solution."""
 _RESET_S = 1e-3
+_WARM_HZ = 0.2
 _SIGMA_FLOOR = 0.01, 0.004, 0.002
 """The smallest deviations that the receiver can tell: m, cycles, Hz."""
 
@@ -70,6 +71,7 @@ class SimulatedReceiver:
         self.device = device
         self.options = options
         self._sky, self._seed, self._part, self._duration_s = sky, seed, part, duration_s
+        self._antenna, self._blocked = antenna, blocked
         self._observer = Observer(sky, antenna, blocked, options, seed, part)
         self._names = np.array([[name, name] for name in sky.satellites], object)
         self._signals = np.array(sky.signals, object)
@@ -116,7 +118,25 @@ class SimulatedReceiver:
         constellation = self._sky.constellation
         known = [constellation.issue(name, self._sky.start_ns - SECOND_NS) for name in constellation.satellites]
         heard = [] if self.options.cold else [*known, constellation.ionosphere]
-        return OwnSolution(self.device, heard, constellation.leap_s), Broadcast(constellation)
+        own = OwnSolution(self.device, heard, constellation.leap_s)
+        if not self.options.cold:
+            for epoch in self._before_start():
+                own.solve(epoch)
+        return own, Broadcast(constellation)
+
+    def _before_start(self) -> Iterator[GnssEpoch]:
+        """Some epochs of a receiver that has been on for a while and moved, if at all, as the flight begins."""
+        options = replace(self.options, rate_hz=_WARM_HZ, missing=0.0, slips=0.0)
+        place, velocity = self._antenna(np.zeros(1))
+
+        def straight(t_s: F64) -> tuple[F64, F64]:
+            return place + t_s[:, None] * velocity, np.repeat(velocity, len(t_s), axis=0)
+
+        observer = Observer(self._sky, straight, self._blocked, options, self._seed, self._part)
+        tracking, clock = Tracking(options, len(self._sky.satellites), self._rng(0)), _Milliseconds()
+        for _, observables in observer.seconds(-1.0, -WARM_S):
+            chances = np.ones((len(observables.t_s), 2, *self._names.shape))
+            yield from (observed.epoch for observed, _ in self._epochs(observables, tracking, clock, chances))
 
     def _pieces(self, broadcast: Broadcast, number: int, tracked: Tracked) -> Iterator[Piece]:
         """Pieces of navigation messages that a second completes, of satellites tracked since they began."""

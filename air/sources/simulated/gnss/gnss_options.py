@@ -19,7 +19,7 @@ class GnssOptions:
 
     `nav` is a RINEX navigation file whose satellites fly instead of the nominal ones. Epochs come at `rate_hz` but
     for the fraction `missing`, at random; nothing below `mask_deg` is tracked. `cold` switches the receiver on at the
-    start; else it has been on for a minute.
+    start; else it has been on for two minutes.
 
     Satellites: `orbit` and `satellite_clock` against what they broadcast. Air: `ionosphere` and `troposphere` scale
     the delays of Klobuchar's model, as it is broadcast, and of Saastamoinen's; the `…_residual`, for a satellite at the

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, count, islice
 
 import numpy as np
 
@@ -23,15 +24,20 @@ class Multipath:
     fading: F64
 
 
-def multipath(options: GnssOptions, satellites: int, seed: int, part: int) -> Iterator[Multipath]:
-    """The state at each second from 0 on: Gauss–Markov processes of unit deviation, independent of each other."""
-    keep = np.exp(-1.0 / options.multipath_s)
-    state = np.random.default_rng([seed, part]).standard_normal((3, satellites, 2))
-    second = 0
-    while True:
+def multipath(options: GnssOptions, satellites: int, seed: int, part: int, begin: int = 0) -> Iterator[Multipath]:
+    """The state at each second from `begin` ≤ 0 on: Gauss–Markov processes of unit deviation, all independent."""
+    first = np.random.default_rng([seed, part]).standard_normal((3, satellites, 2))
+    # Such a process is the same both ways: what was before second 0 does not change what comes after it.
+    before = islice(_states(first, options.multipath_s, [seed, part, 0]), 1, 1 - begin)
+    for state in chain(reversed(list(before)), _states(first, options.multipath_s, [seed, part])):
         yield Multipath(state[0], state[1], FADING_DB * state[2])
-        second += 1
-        news = np.random.default_rng([seed, part, second]).standard_normal(state.shape)
+
+
+def _states(state: F64, correlated_s: float, key: list[int]) -> Iterator[F64]:
+    keep = np.exp(-1.0 / correlated_s)
+    for second in count(1):
+        yield state
+        news = np.random.default_rng([*key, second]).standard_normal(state.shape)
         state = keep * state + np.sqrt(1 - keep**2) * news
 
 

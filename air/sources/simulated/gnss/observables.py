@@ -77,11 +77,11 @@ class Observer:
         self._outage: Intervals = intervals(options.outage, "outage")
         self._jamming: Intervals = intervals(options.jamming, "jamming")
 
-    def seconds(self, duration_s: float) -> Iterator[tuple[int, Observables]]:
-        """The observables of each second of the flight, with its number."""
-        states = multipath(self._options, len(self._sky.satellites), self._key[0], self._key[1] + MULTIPATH)
-        conditions = map(self._conditions, range(int(duration_s) + 2), states)
-        for second, (here, then) in enumerate(pairwise(conditions)):
+    def seconds(self, duration_s: float, begin: int = 0) -> Iterator[tuple[int, Observables]]:
+        """The observables of each second of the flight from `begin` ≤ 0 on, with its number."""
+        states = multipath(self._options, len(self._sky.satellites), self._key[0], self._key[1] + MULTIPATH, begin)
+        conditions = map(self._conditions, range(begin, int(duration_s) + 2), states)
+        for second, (here, then) in enumerate(pairwise(conditions), begin):
             t_s = self._clock.time_of(self._ticks(second))
             present = self._present(second, len(t_s)) & (t_s <= duration_s)
             noise = self._rng(NOISE, second).standard_normal((3, len(t_s), len(self._sky.satellites), 2))
@@ -156,4 +156,5 @@ class Observer:
         return np.asarray(clear - self._options.jamming_db * jammed[:, None, None])
 
     def _rng(self, stream: int, second: int) -> np.random.Generator:
-        return np.random.default_rng([self._key[0], self._key[1] + stream, second])
+        before_start = [1] if second < 0 else []
+        return np.random.default_rng([self._key[0], self._key[1] + stream, abs(second), *before_start])

@@ -14,11 +14,10 @@ from common.arrays import F64
 from common.geo import ecef_to_geodetic
 from common.measurements import Ephemeris, FixKind, GnssEpoch, Ionosphere, ReceiverSolution
 
-_SMOOTHING_S = 5.0
+_SMOOTHING_S = 60.0
 """Over so long positions are averaged, carried along by the Dopplers' velocity."""
 _COASTING_S, _DRIFTING = 3.0, 1.0
 """For so long a solution without measurements goes on, and grows worse by so many m/s."""
-_SETTINGS = PositioningSettings(systems="GEC")
 _EVERY_S = 0.15
 """Positions and velocities are found no more often; between them the last ones are carried along."""
 
@@ -36,6 +35,7 @@ class OwnSolution:
         self._sigma = np.full(2, 4e3)
         self._clock_s = 0.0
         self._kind, self._used = FixKind.NONE, 0
+        self._averaged_s = 0.0
         self._seen_ns = self._tried_ns = self._t_ns = 0
 
     def hear(self, bits: NavigationBits, t_ns: int) -> None:
@@ -50,7 +50,7 @@ class OwnSolution:
             self._position = self._position + self._velocity * dt
         self._t_ns = epoch.t_ns
         if epoch.clock_reset or epoch.t_ns - self._tried_ns >= _EVERY_S * SECOND_NS:
-            found = find_position(epoch, self._broadcast, _SETTINGS, self._position)
+            found = find_position(epoch, self._broadcast, PositioningSettings(), self._position)
             if isinstance(found, PointPosition):
                 self._update(found)
             else:
@@ -81,13 +81,15 @@ class OwnSolution:
             self._sigma = self._sigma + _DRIFTING * (t_ns - self._tried_ns) / SECOND_NS
 
     def _update(self, found: PointPosition) -> None:
-        if np.isfinite(found.velocity).all():
-            self._velocity = found.velocity
-        if self._position is None or self._kind is not FixKind.FIX_3D:
-            self._position = found.position
+        dt = (found.t_ns - self._seen_ns) / SECOND_NS
+        gained = found.velocity - self._velocity if np.isfinite(found.velocity).all() else np.zeros(3)
+        self._velocity = self._velocity + gained
+        if self._position is None or self._kind is FixKind.NONE:
+            self._position, self._averaged_s = found.position, 0.0
         else:
-            gain = min(1.0, (found.t_ns - self._seen_ns) / SECOND_NS / _SMOOTHING_S)
-            self._position = self._position + gain * (found.position - self._position)
+            carried = self._position + gained * dt / 2  # it came at the speed of the last one
+            self._averaged_s = min(self._averaged_s + dt, _SMOOTHING_S)
+            self._position = carried + dt / self._averaged_s * (found.position - carried)
         self._kind = FixKind.FIX_3D
         self._used = len(found.used)
         latitude, longitude, _ = ecef_to_geodetic(found.position)

@@ -11,7 +11,7 @@ from common.arrays import F64, Bool
 
 ACQUIRE_CN0, CODE_CN0, CARRIER_CN0 = 28.0, 22.0, 26.0
 """dBHz from which a signal is found, below which its code is lost, and below which its carrier is."""
-_WARM_S = 60.0
+WARM_S = 120
 """For so long a warm receiver has been on."""
 _SLIPS_DOUBLE_DB = 3.0
 
@@ -55,7 +55,7 @@ class Tracking:
         self._last_s = t_s
         seen = receivable & (cn0 >= np.where(self._code, CODE_CN0, ACQUIRE_CN0))
         new = seen & np.isnan(self._seen_since)
-        self._seen_since[new] = t_s - (_WARM_S if began and not self._options.cold else 0.0)
+        self._seen_since[new] = t_s - (WARM_S if began and not self._options.cold else 0.0)
         self._seen_since[~seen] = np.nan
         self._delay[~seen] = 1.0  # found again sooner than at first
         code = seen & (t_s - self._seen_since >= self._delay)
