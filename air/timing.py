@@ -224,7 +224,7 @@ class Timebase:
     def restamp(self, measurement: M, device: str, scale: TimeScale, arrival_ns: int) -> M | None:
         """The measurement at its GNSS time, or None as long as that is not known.
 
-        `scale` says what its stamp is; `arrival_ns` when it arrived, on the host's clock.
+        `scale` says what its stamp is; `arrival_ns` when it arrived, or was sent at the latest, on the host's clock.
         """
         if scale is TimeScale.GNSS:
             self._observe_receiver(measurement, device, arrival_ns)

@@ -90,6 +90,7 @@ class LineDriver:
 
     def __init__(self) -> None:
         self.counts = Counts()
+        self.sent_ns = 0
         self._held = b""
 
     @property
@@ -101,6 +102,7 @@ class LineDriver:
 
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
         self.counts.received_bytes += len(data)
+        self.sent_ns = t_ns
         *lines, self._held = (self._held + data).split(b"\n")
         self._held = self._held[-100:]
         found: list[Measurement] = []

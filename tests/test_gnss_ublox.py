@@ -50,6 +50,23 @@ def fed(data: bytes, step: int = 1 << 20) -> tuple[UbloxReceiver, list[Measureme
     return driver, [m for at in range(0, len(data), step) for m in driver.feed(data[at : at + step], 0)]
 
 
+# Time
+
+
+@given(st.integers(1, 90), st.integers(1, 4000), st.sampled_from([None, 460_800]))
+def test_an_epoch_was_sent_when_its_first_byte_left(signals: int, step: int, baud: int | None) -> None:
+    """Whatever the number of signals, for its solution too, and however a port's driver cuts the bytes."""
+    rows = [i % len(EPOCH.satellites) for i in range(signals)]
+    many = {f.name: v[rows] for f in fields(EPOCH) if isinstance(v := getattr(EPOCH, f.name), np.ndarray)}
+    names = {key: tuple(getattr(EPOCH, key)[i] for i in rows) for key in ("satellites", "signals")}
+    data = ubx.frame(RXM_RAWX, pack_rawx(replace(EPOCH, **many, **names))) + FRAMES[2]  # type: ignore[arg-type]
+    driver, byte_ns, begun_ns = UbloxReceiver(baud=baud), 10e9 / (baud or 1e12), 7_000_000_000
+    for at in range(0, len(data), step):
+        piece = data[at : at + step]
+        if driver.feed(piece, begun_ns + round((at + len(piece)) * byte_ns)):
+            assert abs(driver.sent_ns - begun_ns) <= (1 if baud else 50_000)
+
+
 # Payloads, both ways
 
 

@@ -16,6 +16,7 @@ VARIANTS = {
     "imu": Scene(seed=1),
     "camera": Scene(seed=2, device="camera"),
     "serial": Scene(seed=3, jitter_s=1e-3, read_s=3.5e-3),
+    "receiver on a line": Scene(seed=5, baud=921_600),
     "no steps": Scene(seed=4, reset_s=None, suspend_s=None),
 }
 

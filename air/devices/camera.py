@@ -133,4 +133,4 @@ class CameraReader:
         self._watch.received(now_ns * 1e-9, len(frame.data), 1, 0, ["CameraFrame"])
         # The kernel stamps in the host's time: the frame then arrived, so to speak, at its stamp.
         arrival_ns = frame.t_ns if self._camera.scale is TimeScale.ARRIVAL else now_ns
-        self._take(Arrival(NAME, self._camera.scale, arrival_ns, [frame]))
+        self._take(Arrival(NAME, self._camera.scale, arrival_ns, arrival_ns, [frame]))

@@ -33,11 +33,15 @@ START_AGAIN_S = 5.0
 
 @dataclass(frozen=True)
 class Arrival:
-    """What a device gave at once; `arrival_ns` is the host's monotonic time when the last of it came."""
+    """What a device gave at once.
+
+    `arrival_ns` is the host's monotonic time when the last of it came, `sent_ns` when it was sent at the latest.
+    """
 
     device: str
     scale: TimeScale
     arrival_ns: int
+    sent_ns: int
     measurements: list[Measurement]
 
 
@@ -137,7 +141,8 @@ class Port:
         kinds = [type(measurement).__name__ for measurement in measurements]
         self._watch.received(arrival_ns * 1e-9, len(data), frames, dropped, kinds)
         raw = RawBytes(arrival_ns, self._driver.device, data)
-        self._take(Arrival(self._driver.device, self._driver.scale, arrival_ns, [raw, *measurements]))
+        driver = self._driver
+        self._take(Arrival(driver.device, driver.scale, arrival_ns, driver.sent_ns, [raw, *measurements]))
 
     def _write(self, link: Link) -> None:
         while self._outgoing:

@@ -43,6 +43,11 @@ class Driver(Protocol):
         """What is wrong with the device or its set-up, as far as it says so itself: a line each."""
         ...
 
+    @property
+    def sent_ns(self) -> int:
+        """When what `feed` gave last was sent, in the host's time, at the latest: as it arrived, or sooner."""
+        ...
+
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
         """Measurements that these bytes complete. `t_ns` is when they arrived, in the host's time."""
         ...

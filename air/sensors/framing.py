@@ -27,6 +27,11 @@ class FrameScanner:
         self._held = b""
         self._in_burst = False
 
+    @property
+    def held(self) -> int:
+        """How many bytes of an unfinished frame it holds."""
+        return len(self._held)
+
     def feed(self, data: bytes) -> list[bytes]:
         """The whole frames, in their order, that these bytes complete."""
         self._counts.received_bytes += len(data)

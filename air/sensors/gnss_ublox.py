@@ -13,9 +13,11 @@ from air.sensors.ubx_messages import ACK_ACK, ACK_NAK, CFG_VALSET, NAV_PVT, RXM_
 from air.sensors.ubx_pvt import parse_pvt
 from air.sensors.ubx_rawx import parse_rawx
 from common.clock import GPST_MINUS_UTC_NS
-from common.measurements import Measurement
+from common.measurements import GnssEpoch, Measurement, ReceiverSolution
 
 _NMEA, _UBX = b"$"[0], ubx.SYNC[0]
+_SAME_EPOCH_NS = 20_000_000
+"""A solution's time is that of its epoch but for the receiver's clock error."""
 _PROBES = {_UBX: ubx.probe, _NMEA: ubx.probe_nmea, rtcm.PREAMBLE: rtcm.probe}
 
 
@@ -25,15 +27,23 @@ class UbloxReceiver:
     NMEA and RTCM between UBX frames are counted and left aside. What satellites broadcast waits for the receiver to
     know the time, which takes a second or two. At 10 Hz it sends 17 kB/s: a serial line takes 230400 baud or more,
     and that the settings of `start` leave as it is.
+
+    On a line of `baud` an epoch arrives the later the more signals it holds, 0.35 ms for each at 921600, and so does
+    the solution after it. So what counts for `sent_ns` is the first byte of the epoch, for its solution too.
+    Without `baud` messages arrive whole, as over USB.
     """
 
-    def __init__(self, device: str = "gnss", port: Port = Port.USB, rate_hz: int = 10) -> None:
+    def __init__(
+        self, device: str = "gnss", port: Port = Port.USB, rate_hz: int = 10, baud: int | None = None
+    ) -> None:
         self._device = device
         self._port = port
         self._rate_hz = rate_hz
         self._counts = Counts()
         self._scanner = FrameScanner(self._counts, _PROBES)
         self._navigation = NavigationMessages()
+        self._ns_per_byte = 0.0 if baud is None else 10e9 / baud
+        self._sent_ns = self._epoch_ns = 0
         self._t_ns: int | None = None
         self._leap_s = GPST_MINUS_UTC_NS // 1_000_000_000
         self._configured: bool | None = None
@@ -68,9 +78,30 @@ class UbloxReceiver:
         """The message that sets measurements and messages, in the receiver's memory until it loses power."""
         return settings_frame(self._port, self._rate_hz)
 
+    @property
+    def sent_ns(self) -> int:
+        """When the first byte of the latest epoch, or of a solution without one, left the receiver."""
+        return self._sent_ns
+
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
-        """Measurements that these bytes complete, stamped by the receiver; `t_ns` is not needed."""
-        return [measurement for frame in self._scanner.feed(data) for measurement in self._measurements(frame)]
+        """Measurements that these bytes complete, stamped by the receiver; `t_ns` tells only when they were sent."""
+        found: list[Measurement] = []
+        frames = self._scanner.feed(data)
+        left = sum(map(len, frames)) + self._scanner.held
+        for frame in frames:
+            begun_ns = t_ns - round(left * self._ns_per_byte)
+            left -= len(frame)
+            for measurement in self._measurements(frame):
+                self._note_sent(measurement, begun_ns)
+                found.append(measurement)
+        return found
+
+    def _note_sent(self, measurement: Measurement, begun_ns: int) -> None:
+        """Take note of a message that tells the time, and of when its first byte left."""
+        if isinstance(measurement, GnssEpoch):
+            self._epoch_ns, self._sent_ns = measurement.t_ns, begun_ns
+        elif isinstance(measurement, ReceiverSolution) and abs(measurement.t_ns - self._epoch_ns) > _SAME_EPOCH_NS:
+            self._sent_ns = begun_ns
 
     def _measurements(self, frame: bytes) -> Iterable[Measurement]:
         if frame[0] != _UBX:

@@ -51,6 +51,7 @@ class XsensImu:
         self._counts = Counts()
         self._scanner = FrameScanner(self._counts)
         self._clock = _SampleClock()
+        self._sent_ns = 0
         self._counter: int | None = None
         self._configured: bool | None = None
         self._error: str | None = None
@@ -93,8 +94,14 @@ class XsensImu:
             + frame(MessageId.GO_TO_MEASUREMENT)
         )
 
+    @property
+    def sent_ns(self) -> int:
+        """The arrival of the latest bytes."""
+        return self._sent_ns
+
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
-        """Samples that these bytes complete, stamped by the device; `t_ns` is not needed."""
+        """Samples that these bytes complete, stamped by the device; `t_ns` tells only when they arrived."""
+        self._sent_ns = t_ns
         samples: list[Measurement] = []
         for message, payload in self._scanner.feed(data):
             if message != MessageId.MT_DATA2:

@@ -20,6 +20,7 @@ class MavlinkVehicle:
         self._device = device
         self._scale = _SCALES[stamps]
         self._telemetry = Telemetry(system, stamps)
+        self._sent_ns = 0
 
     @property
     def device(self) -> str:
@@ -41,8 +42,14 @@ class MavlinkVehicle:
         """None: what is wrong with the drone stands in its state."""
         return ()
 
+    @property
+    def sent_ns(self) -> int:
+        """The arrival of the latest bytes."""
+        return self._sent_ns
+
     def feed(self, data: bytes, t_ns: int) -> list[Measurement]:
         """States of the vehicle that follow from these bytes, ten a second at most."""
+        self._sent_ns = t_ns
         return [*self._telemetry.feed(data, t_ns)]
 
     def start(self) -> bytes:

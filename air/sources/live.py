@@ -130,7 +130,7 @@ class Live:
             if isinstance(measurement, RawBytes):
                 yield replace(measurement, t_ns=self._host_to_gnss(arrival.arrival_ns))
                 continue
-            stamped = self._timebase.restamp(measurement, arrival.device, arrival.scale, arrival.arrival_ns)
+            stamped = self._timebase.restamp(measurement, arrival.device, arrival.scale, arrival.sent_ns)
             if stamped is not None:
                 yield stamped
 
@@ -164,7 +164,9 @@ def _ports(devices: DevicesConfig) -> Iterator[tuple[Driver, PortConfig]]:
         from air.sensors.gnss_ublox import UbloxReceiver
         from air.sensors.ublox_settings import Port as Connector
 
-        yield UbloxReceiver(port=Connector(devices.gnss.connector)), devices.gnss
+        connector = Connector(devices.gnss.connector)
+        baud = None if connector is Connector.USB else devices.gnss.baud
+        yield UbloxReceiver(port=connector, baud=baud), devices.gnss
     if devices.imu.port:
         from air.sensors.imu_xsens import XsensImu
 

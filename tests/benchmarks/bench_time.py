@@ -19,6 +19,7 @@ VARIANTS = {
     "camera, USB": {"device": "camera"},
     "IMU, serial": {"jitter_s": 1e-3, "read_s": 3.5e-3},
     "IMU, GNSS at 5 Hz": {"gnss_hz": 5.0},
+    "IMU, GNSS on a line": {"baud": 921_600},
     "IMU, no steps": {"reset_s": None, "suspend_s": None},
 }
 FIGURES = (

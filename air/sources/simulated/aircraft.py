@@ -140,8 +140,14 @@ class Aircraft:
 
     def drivers(self) -> dict[str, Driver]:
         """New drivers of the devices that are there, by name."""
-        drivers = (XsensImu("imu"), UbloxReceiver("gnss"), UbloxReceiver("base"), MavlinkVehicle("mavlink"))
-        return {driver.device: driver for driver in drivers if driver.device not in self.options.off}
+        options = self.options
+        drivers = (
+            XsensImu("imu"),
+            UbloxReceiver("gnss", baud=options.gnss.baud),
+            UbloxReceiver("base", baud=options.base.baud),
+            MavlinkVehicle("mavlink"),
+        )
+        return {driver.device: driver for driver in drivers if driver.device not in options.off}
 
     def arrivals(self) -> Iterator[Arrival]:
         """All that arrives at the host until the end of the flight, in order."""

@@ -104,22 +104,24 @@ class _Host:
         host_ns, device, data = self._aircraft.host_ns(arrival.t_s), arrival.device, arrival.data
         self._tell_time_of_day(host_ns)
         if isinstance(data, CameraFrame):
-            told = self._stamped([data], device, TimeScale.DEVICE, host_ns)
+            told = self._stamped([data], device, TimeScale.DEVICE, host_ns, host_ns)
             return Heard(arrival.t_s, device, len(data.data), 1, 0, [data], told)
         raw = RawBytes(self._time_of_day_ns(host_ns), device, data)
         driver = self._drivers[device]
         counts = driver.counts
         frames, dropped = counts.frames.total(), counts.dropped_bytes
         found = driver.feed(data, host_ns)
-        told = [raw, *self._stamped(found, device, driver.scale, host_ns)]
+        told = [raw, *self._stamped(found, device, driver.scale, host_ns, driver.sent_ns)]
         frames, dropped = counts.frames.total() - frames, counts.dropped_bytes - dropped
         return Heard(arrival.t_s, device, len(data), frames, dropped, found, told)
 
-    def _stamped(self, found: Sequence[Measurement], device: str, scale: TimeScale, host_ns: int) -> list[Measurement]:
+    def _stamped(
+        self, found: Sequence[Measurement], device: str, scale: TimeScale, host_ns: int, sent_ns: int
+    ) -> list[Measurement]:
         """Those of known time, and once a second the states of the clocks."""
         if device == BASE:  # far away: it tells nothing about the clocks on board
             return list(found)
-        stamped = [self._timebase.restamp(measurement, device, scale, host_ns) for measurement in found]
+        stamped = [self._timebase.restamp(measurement, device, scale, sent_ns) for measurement in found]
         return [*(known for known in stamped if known is not None), *self._timebase.states(host_ns)]
 
     def _tell_time_of_day(self, host_ns: int) -> None:

@@ -34,8 +34,8 @@ def _least_delay(aircraft: Aircraft, device: str) -> float:
     driver = aircraft.drivers()[device]
     delays_s = []
     for t_s, data in takewhile(lambda sent: sent[0] < BENCH_S, aircraft.sent(device)):
-        sampled = (_sampled_s(aircraft, measurement) for measurement in driver.feed(data, 0))
-        delays_s += [t_s - sampled_s for sampled_s in sampled if sampled_s is not None]
+        sampled = [_sampled_s(aircraft, measurement) for measurement in driver.feed(data, round(t_s * 1e9))]
+        delays_s += [driver.sent_ns * 1e-9 - sampled_s for sampled_s in sampled if sampled_s is not None]
     return _rounded(aircraft, delays_s)
 
 
