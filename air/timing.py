@@ -31,7 +31,7 @@ SETTLED_S = 30.0
 """From this span on a window tells its drift better than what was known before it."""
 KNOWN_DRIFT = 2e-6
 """A drift that was learnt once stays within this, through steps and gaps."""
-LOCKED_S, LOCKED_SAMPLES = 2.0, 20
+LOCKED_S, LOCKED_SAMPLES = 2.0, 10
 HOLDOVER_S = 3.0
 
 _EARLY_S = 0.3e-3

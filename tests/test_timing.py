@@ -99,6 +99,15 @@ def test_the_known_part_of_a_delay_is_taken_off() -> None:
     assert clock.host_ns(10_000_000_000) - HOST_NS == pytest.approx(10_000_000_000, abs=1_000)
 
 
+def test_a_camera_at_two_frames_a_second_is_known_within_five_seconds() -> None:
+    clock = ClockFilter()
+    locked = []
+    for i in range(12):
+        clock.observe(i * 500_000_000, HOST_NS + i * 500_000_000)
+        locked.append(clock.locked)
+    assert locked.index(True) == 9
+
+
 def test_through_a_gap_the_drift_goes_on_and_sigma_grows() -> None:
     clock = ClockFilter()
     for i in range(6000):
