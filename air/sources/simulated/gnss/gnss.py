@@ -29,7 +29,7 @@ ROVER, BASE_STATION = 54, 61
 _PROCESSING_S, _SOLVING_S = 0.03, 0.01
 """From the epoch to its raw measurements, and from these to the solution."""
 _RESET_S = 1e-3
-_WARM_HZ = 0.2
+_WARM_HZ = 0.1
 _SIGMA_FLOOR = 0.01, 0.004, 0.002
 """The smallest deviations that the receiver can tell: m, cycles, Hz."""
 
