@@ -19,6 +19,8 @@ CLOCKS = {"G": "G", "J": "G", "E": "E", "R": "R", "C": "C"}
 """Clock that each system's ranges share: QZSS runs on GPS time."""
 NEAREST, FURTHEST = 1.0e7, 1.0e8
 """Pseudoranges in m beyond these were not measured, whatever the receiver's clock shows."""
+FASTEST = 1.0e5
+"""Nor were range rates in m/s beyond this."""
 
 _URA_BOUNDS = (2.4, 3.4, 4.85, 6.85, 9.65, 13.65, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, 1536.0, 3072.0, 6144.0)
 _GLONASS_ACCURACY = 5.0
@@ -69,6 +71,8 @@ def clean_ranges(epoch: GnssEpoch, broadcast: Ephemerides, settings: Positioning
     index = np.array([row[3] for row in rows], int)
     states = states_at_transmission(ephemerides, epoch.t_ns, epoch.pseudorange[index])
     f = np.array([frequency(epoch.satellites[i], epoch.signals[i], epoch.channel[i]) for i in index], float)
+    range_rate, sigma_rate = -epoch.doppler[index] * (LIGHT / f), epoch.sigma_doppler[index] * (LIGHT / f)
+    range_rate[~(np.abs(range_rate) < FASTEST)] = np.nan
     kept = np.isfinite(states.position).all(axis=1) & np.isfinite(states.clock) & np.isfinite(f)
     rejected |= {row[0]: "senseless ephemeris" for row, good in zip(rows, kept, strict=True) if not good}
     satellites = tuple(row[0] for row, good in zip(rows, kept, strict=True) if good)
@@ -77,8 +81,8 @@ def clean_ranges(epoch: GnssEpoch, broadcast: Ephemerides, settings: Positioning
         clock=tuple(CLOCKS[satellite[0]] for satellite in satellites),
         states=SatelliteStates(states.position[kept], states.velocity[kept], states.clock[kept], states.drift[kept]),
         pseudorange=np.array([row[2] for row in rows], float)[kept],
-        range_rate=-epoch.doppler[index][kept] * LIGHT / f[kept],
-        sigma_rate=epoch.sigma_doppler[index][kept] * LIGHT / f[kept],
+        range_rate=range_rate[kept],
+        sigma_rate=np.minimum(sigma_rate, FASTEST)[kept],
         frequency=f[kept],
         sigma=np.array([_ephemeris_sigma(ephemeris) for ephemeris in ephemerides], float)[kept],
         rejected=rejected,

@@ -32,6 +32,8 @@ SATELLITE_NAMES = {
 SATELLITE_IDS = {name: ids for ids, name in SATELLITE_NAMES.items()}
 SIGNAL_NAMES = {(constellation, i): name for constellation, names in _SIGNALS.items() for i, name in names.items()}
 """(gnssId, sigId) → the last two letters of RINEX observation codes."""
+_SIGNAL_IDS = {(constellation, name): i for (constellation, i), name in reversed(SIGNAL_NAMES.items())}
+"""Of several identifiers of a name, the first."""
 _D2 = {0: 1, 2: 3, 4: 10}
 """sigId of a BeiDou signal with D1 → the same with D2."""
 
@@ -39,7 +41,5 @@ _D2 = {0: 1, 2: 3, 4: 10}
 def signal_id(satellite: str, signal: str) -> int:
     """The sigId of a signal by its RINEX names; geostationary BeiDou satellites send D2. KeyError where it has none."""
     constellation, _ = SATELLITE_IDS[satellite]
-    ids = [i for i, name in _SIGNALS[constellation].items() if name == signal]
-    if not ids:
-        raise KeyError(f"{satellite} has no signal {signal}")
-    return _D2.get(ids[0], ids[0]) if satellite in GEOSTATIONARY else ids[0]
+    found = _SIGNAL_IDS[constellation, signal]
+    return _D2.get(found, found) if satellite in GEOSTATIONARY else found
