@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from common import ned
 from common.arrays import F64
 from common.measurements import FixKind, Severity
-from common.se3 import matrix_to_quaternion, quaternion_to_matrix
 
 Values = dict[str, Any]
 """Fields of a `VehicleState` that a message tells; None where it says that it does not know."""
@@ -33,8 +33,6 @@ _FIXES = (
     FixKind.FIX_3D,  # static
     FixKind.FIX_3D,  # precise point positioning
 )
-_R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-_R_FRD_FLU = np.diag([1.0, -1.0, -1.0])
 _YAW_LOCK, _YAW_IN_VEHICLE_FRAME, _YAW_IN_EARTH_FRAME = 16, 32, 64
 
 
@@ -53,22 +51,11 @@ def yaw_of(message: Any) -> float | None:
 
 
 def _attitude(m: Any, yaw: float | None) -> Values:
-    roll, pitch = _finite(m.roll), _finite(m.pitch)
-    if roll is None or pitch is None or _finite(m.yaw) is None:
-        return {"q_enu_body": None}
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in (roll, pitch, m.yaw))
-    q_ned_frd = (
-        cy * cp * cr + sy * sp * sr,
-        cy * cp * sr - sy * sp * cr,
-        cy * sp * cr + sy * cp * sr,
-        sy * cp * cr - cy * sp * sr,
-    )
-    return {"q_enu_body": _enu_flu(np.array(q_ned_frd))}
+    return {"q_enu_body": ned.attitude_of_angles(m.roll, m.pitch, m.yaw)}
 
 
 def _attitude_quaternion(m: Any, yaw: float | None) -> Values:
-    q = _unit((m.q1, m.q2, m.q3, m.q4))
-    return {"q_enu_body": None if q is None else _enu_flu(q)}
+    return {"q_enu_body": ned.attitude((m.q1, m.q2, m.q3, m.q4))}
 
 
 def _global_position(m: Any, yaw: float | None) -> Values:
@@ -213,11 +200,6 @@ def _euler(q: F64) -> tuple[float, float, float]:
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def _enu_flu(q_ned_frd: F64) -> F64:
-    """The attitude (4,) wxyz of forward-left-up in ENU, from that of forward-right-down in NED."""
-    return matrix_to_quaternion(_R_ENU_NED @ quaternion_to_matrix(q_ned_frd) @ _R_FRD_FLU)
 
 
 def _gimbal(

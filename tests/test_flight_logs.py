@@ -19,11 +19,12 @@ from pymavlink import DFReader, mavutil
 from pyulog import ULog
 
 from air.gnss.gnss_time import from_week
-from air.sources import ned, ulog
+from air.sources import ulog
 from air.sources.cuav import time_of
 from air.sources.dataflash import LogScanner
 from air.sources.imported import Faults
 from air.sources.source import open_source
+from common import ned
 from common.counts import Counts
 from common.errors import SourceError
 from common.measurements import CameraFrame, FixKind, ImuSample, ReceiverSolution, VehicleState

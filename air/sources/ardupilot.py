@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from air.gnss.gnss_time import from_week
-from air.sources import ned
 from air.sources.dataflash import LogMessage, LogScanner
 from air.sources.imported import GEOID_SIGMA, Faults, Imported, find_file, reordered
 from air.sources.source import Sensed
+from common import ned
 from common.counts import Counts
 from common.errors import SourceError
 from common.measurements import FixKind, ImuSample, ReceiverSolution, VehicleState

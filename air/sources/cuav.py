@@ -15,10 +15,10 @@ import numpy as np
 from PIL import Image
 
 from air.sensors.calibration import Calibration, read_calibration
-from air.sources import ned
 from air.sources.imported import GEOID_SIGMA, Faults, Imported, find_folder, gpst_of_unix, in_time_order, one_line
 from air.sources.mavlink_file import open_mavlink
 from air.sources.source import Sensed
+from common import ned
 from common.counts import Counts
 from common.errors import LuojiaError, SourceError
 from common.mavlink import Packet, PacketScanner

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from air.sources import ned
 from air.sources.gopro_telemetry import Telemetry
 from air.sources.imported import GEOID_SIGMA
+from common import ned
 from common.arrays import F64
 from common.measurements import FixKind, ReceiverSolution, VehicleState
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from pyulog import ULog
 
-from air.sources import ned
 from air.sources.imported import Faults, Imported, find_file, gpst_of_unix, in_time_order, one_line
 from air.sources.source import Sensed
+from common import ned
 from common.arrays import F64
 from common.errors import SourceError
 from common.measurements import FixKind, ImuSample, ReceiverSolution, VehicleState
