@@ -98,7 +98,8 @@ def test_an_unusable_photo_says_why(damaged, reason):
 
 @given(st.binary(max_size=200), st.integers(0, len(TEXTURE) - 1))
 def test_no_bytes_make_the_preparation_raise(noise, at):
-    prepare(Photo(0, "a.jpg", TEXTURE[:at][:3000] + noise, None, None), AlignmentSettings())
+    prepared = prepare(Photo(0, "a.jpg", TEXTURE[:at][:3000] + noise, None, None), AlignmentSettings())
+    assert bool(prepared.fault) == (prepared.features is None)
 
 
 def test_a_guess_for_another_size_is_scaled():

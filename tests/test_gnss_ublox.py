@@ -290,7 +290,8 @@ def test_the_receiver_is_told_what_to_send_and_its_answer_noticed() -> None:
 @pytest.mark.parametrize("port", Port)
 def test_every_setting_is_one_that_the_receiver_knows(port: Port) -> None:
     for key, _ in receiver_settings(port, 10):
-        pyubx2.cfgname2key(key)
+        identity, _ = pyubx2.cfgname2key(key)
+        assert pyubx2.cfgkey2name(identity)[0] == key
 
 
 @given(st.lists(st.binary(min_size=2, max_size=300), min_size=1, max_size=4), st.integers(1, 50))

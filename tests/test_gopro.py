@@ -95,7 +95,10 @@ def test_a_length_beyond_the_payload_ends_it_and_is_counted() -> None:
 def test_any_bytes_are_read_without_complaint(data: bytes, cut: int) -> None:
     whole = gpmf.payload(gpmf.imu_stream("GYRO", np.ones((4, 3)), 4))
     for damaged in (data, whole[:cut] + data, data + whole, whole[:cut]):
-        list(read_series(damaged))
+        damage = Damage()
+        found = list(read_series(damaged, damage))
+        assert all(series.values.ndim == 2 and len(series.values) <= len(damaged) for series in found)
+        assert 0 <= damage.dropped_bytes <= len(damaged)
 
 
 # Telemetry

@@ -221,8 +221,9 @@ def test_any_damage_to_a_file_is_survived(data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(text)))
     junk = data.draw(st.text(max_size=40))
     broken = (text[:cut] + junk + text[data.draw(st.integers(cut, len(text))) :]).splitlines()
-    list(read_navigation(Lines(broken)))
-    list(read_observations(Lines(broken), {}, "gnss"))
+    assert all(isinstance(m, KeplerEphemeris | GlonassEphemeris | Ionosphere) for m in read_navigation(Lines(broken)))
+    for epoch in read_observations(Lines(broken), {}, "gnss"):
+        assert len(epoch.satellites) == len(epoch.signals) == len(epoch.pseudorange)
 
 
 def test_leap_seconds_follow_the_bulletins() -> None:
