@@ -34,7 +34,6 @@ _TARGET = 0.19
 _SHORTEST_S, _LARGEST_GAIN = 2e-5, 16.0
 _METERED = 8
 _SENDING_S = 0.004
-_BLOCK = 8
 
 
 @dataclass(frozen=True)
@@ -147,9 +146,10 @@ class SimulatedCamera:
         self._smeared = np.empty_like(self._light)
         self._depth: F32 = np.empty((height, width), np.float32)
         self._what: I32 = np.empty((height, width), np.int32)
-        blocks = -(-height // _BLOCK) * -(-width // _BLOCK)
+        blocks = -(-height // raycast.BLOCK) * -(-width // raycast.BLOCK)
         self._blocks: I32 = np.empty((blocks, raycast.CANDIDATES + 2), np.int32)
         self._starts: F32 = np.empty(len(self._blocks), np.float32)
+        self._chunk: F64 = np.zeros(raycast.CHUNK_ROOM)
         self._normals = np.random.default_rng([seed, _NOISE]).standard_normal(_NORMALS + 3 * width, np.float32)
 
     @property
@@ -213,11 +213,12 @@ class SimulatedCamera:
     def look(self, poses: Poses) -> F32:
         """Light (H, W, 3) BGR that falls on the sensor behind a perfect lens; overwritten by the next."""
         surface, pace = self._site.at(poses.t_s)
-        raycast.render(
-            surface, self._site.light, self._rays, np.ascontiguousarray(poses.R_world_cam),
-            np.ascontiguousarray(poses.p_world), _BLOCK, 1 / self.model.fx, self.line_time_s, poses.t_s, pace,
-            self._site.sway, self._blocks, self._starts, self._light, self._depth, self._what,
+        view = raycast.View(
+            self._rays, np.ascontiguousarray(poses.R_world_cam), np.ascontiguousarray(poses.p_world),
+            1 / self.model.fx, self.line_time_s, poses.t_s, pace, self._depth, self._what, self._blocks, self._starts,
+            self._chunk,
         )  # fmt: skip
+        raycast.render(surface, self._site.light, view, self._site.sway, self._light)
         return self._light
 
     def _encoded(self, image: U8) -> bytes:

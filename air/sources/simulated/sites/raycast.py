@@ -8,6 +8,7 @@ Voxel Traversal Algorithm for Ray Tracing, 1987; Tevs et al., Maximum Mipmaps, 2
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,19 +35,51 @@ WATER, SKY = -2, -3
 """What a ray meets beside solids (from 0 on) and the raster (−1)."""
 CANDIDATES = 96
 """Solids that a block of pixels can meet, at most."""
+BLOCK = 8
+"""Pixels along the side of a block, which is one beam, and between the first rays."""
+_CHUNK = 32
+"""Rays of a row that one step of Newton's moves at once: what fits vectors of any processor."""
+_T, _DX, _DY, _DZ, _U, _V, _Z00, _Z01, _Z10, _Z11, _STEP, _GUESS, _NEARBY = range(0, 13 * _CHUNK, _CHUNK)
+CHUNK_ROOM = 13 * _CHUNK
+"""Numbers that a chunk of rays needs room for."""
+_FAR = (8, 4, 4, 2, 2, 1, 1)
+"""How far, in pixels, the rays of each sweep are from the two that they are between: left and right, or up and down."""
 _SMOOTH, _ROUGH, _EMPTY = 0, 1, 2
 _SMOOTH_SLOPE, _GRAZING = 0.4, 1.8
 _SKYWARD = -0.08
 """Rays that descend less, per metre of depth, see the sky."""
 _RASTER = -16 + GROUND
-_NEAR, _NEXT = 0.02, 1.01
-"""Rays whose depths differ by less than this share belong to one surface; how far a ray beside one other looks."""
+_NEAR = 0.02
+"""Rays whose depths differ by less than this share belong to one surface."""
 _UNIT = 1.0 / (LIGHT_SCALE * LIGHT_SCALE)
 _PER_CELL = 1.0 / CELL
 _PER_LEAF = 50.0
 _FINEST = 0.05
 """Pixels of this width, m, no longer see the finest detail."""
 _LOW, _BLUE, _GREEN, _STRENGTH = np.uint64(0xFFFF), np.uint64(16), np.uint64(32), np.uint64(48)
+
+
+class View(NamedTuple):
+    """The rays of a frame, each row of the camera at its own pose, and room for what they meet.
+
+    `rays` (H, W, 2) at depth 1, `R` (H, 3, 3) and `p` (H, 3) m the rows' `T_world_cam`, `pixel` the width of a pixel at
+    depth 1; rows are `row_s` apart, the middle one at `t_s`; moving solids go `pace` (K, 2) m/s. `depth` (H, W) gets
+    z in the camera, m, `what` (H, W) the solid and face. `blocks` (B, CANDIDATES + 2), `starts` (B,) and `chunk`
+    (CHUNK_ROOM,) are room for what each block can meet and for a chunk of rays.
+    """
+
+    rays: F32
+    R: F64
+    p: F64
+    pixel: float
+    row_s: float
+    t_s: float
+    pace: F64
+    depth: F32
+    what: I32
+    blocks: I32
+    starts: F32
+    chunk: F64
 
 
 @compiled
@@ -81,13 +114,16 @@ def _start(
     t, level, flat = 0.0, LEVELS - 1, max(math.hypot(dx, dy), 1e-6)
     fall = spread - dz
     for _ in range(400):
+        # A cell knows what is within one cell of it: half for the way ahead, half for the beam's width.
         size = 0.5 * INDEX_CELL * (1 << level)
-        ahead = t + size / flat
+        known = min(t + size / flat, (size - pad) / spread)
         low = (oz - pad - s.tops[_cell_of(s, ox + t * dx, oy + t * dy, level)]) / fall
-        if low >= ahead:
-            t = ahead
+        if low >= known:
+            t = max(t, known)
+            if level == LEVELS - 1 and t * spread + pad >= size:
+                return t
             level = min(level + 1, LEVELS - 1)
-        elif level > 0 and t * spread + pad < 0.5 * size:  # the level below still sees beyond the beam
+        elif level > 0 and t * spread + pad < 0.5 * size:
             level -= 1
         else:
             return float(max(t, low))
@@ -107,45 +143,66 @@ def look_ahead(
     flat = math.hypot(dx, dy)
     if flat > -_GRAZING * dz:
         kind = _ROUGH
-    step, last = 0.5 * INDEX_CELL / max(flat, 1e-6), -1
+    last = (oz + pad - s.lowest) / (-dz - spread)
+    seen = -1
     for _ in range(2000):
-        c = _cell_of(s, ox + t * dx, oy + t * dy, 0)
-        columns = s.floor.shape[1]
-        i, j = c // columns, c % columns
-        if c != last:
-            last = c
-            if s.steep[i, j] > _SMOOTH_SLOPE:
-                kind = _ROUGH
-            for n in range(s.first[c], s.first[c + 1]):
-                k, known = s.listed[n], False
-                for m in range(count):
-                    known = known or found[m] == k
-                if not known and count < CANDIDATES and _near(s, k, ox, oy, oz, dx, dy, dz, spread):
-                    found[count] = k
-                    count += 1
-        bottom = (oz + pad - s.floor[i, j]) / (-dz - spread)
-        if bottom <= t + step:
+        wide, end = _stride(t, flat, last, spread, pad)
+        bottom = t
+        for di in range(-wide, wide + 1):
+            for dj in range(-wide, wide + 1):
+                x, y = ox + t * dx + 2 * dj * INDEX_CELL, oy + t * dy + 2 * di * INDEX_CELL
+                c = _cell_of(s, x, y, 0)
+                i, j = c // s.floor.shape[1], c % s.floor.shape[1]
+                bottom = max(bottom, (oz + pad - s.floor[i, j]) / (-dz - spread))
+                if c == seen:
+                    continue
+                seen = c
+                if s.steep[i, j] > _SMOOTH_SLOPE:
+                    kind = _ROUGH
+                for n in range(s.first[c], s.first[c + 1]):
+                    k, known = s.listed[n], False
+                    for m in range(count):
+                        known = known or found[m] == k
+                    if not known and count < CANDIDATES and _near(s, k, ox, oy, oz, dx, dy, dz, spread, last):
+                        found[count] = k
+                        count += 1
+        if bottom <= end:
             break
-        t += step
+        t = end
     for k in range(s.still, len(s.solids)):
-        if count < CANDIDATES and _near(s, k, ox, oy, oz, dx, dy, dz, spread):
+        if count < CANDIDATES and _near(s, k, ox, oy, oz, dx, dy, dz, spread, last):
             found[count] = k
             count += 1
     return start, kind, count
 
 
 @compiled
-def _near(s: Surface, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, spread: float) -> bool:
-    """Whether a beam may touch a solid, or the ground that a moving one shades."""
+def _stride(t: float, flat: float, last: float, spread: float, pad: float) -> tuple[int, float]:
+    """How many cells to each side of a beam to look at, every second one, and up to where that is all it can meet."""
+    for wide in range(64):
+        reach = (wide + 0.5) * INDEX_CELL
+        end = min(t + reach / max(flat, 1e-6), last)
+        if end * spread + pad <= reach:
+            return wide, end
+    return 64, end
+
+
+@compiled
+def _near(
+    s: Surface, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, spread: float, last: float
+) -> bool:
+    """Whether a beam that ends at `last` may touch a solid, or the ground that a moving one shades."""
     solid = s.solids[k]
     reach = math.hypot(solid.a, solid.b) + (5.0 if k >= s.still else 0.1)
     rx, ry = solid.x - ox, solid.y - oy
-    flat = dx * dx + dy * dy
-    # Nearest approach in plan, of the part of the beam between the solid's top and far below it.
-    t = max((rx * dx + ry * dy) / max(flat, 1e-9), 0.0) if flat > 1e-9 else (oz - solid.top) / -dz
-    t = max(t, (oz - solid.top) / (spread - dz))
-    far = math.hypot(rx - t * dx, ry - t * dy)
-    return bool(far < reach + 1.5 * t * spread + 0.1)
+    flat = math.hypot(dx, dy)
+    # Where the beam, which widens, comes nearest in plan, of its part below the solid's top.
+    t = last
+    if flat > spread:
+        beside = abs(rx * dy - ry * dx) / flat
+        t = (rx * dx + ry * dy) / (flat * flat) + beside * spread / (flat * math.sqrt(flat * flat - spread * spread))
+    t = max(min(t, last), (oz - solid.top) / (spread - dz), 0.0)
+    return bool(math.hypot(rx - t * dx, ry - t * dy) < reach + t * spread + 0.1)
 
 
 @compiled
@@ -223,15 +280,28 @@ def _between(
 
 
 @compiled
-def _next_to(
-    s: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, first: float, second: float
-) -> float:
-    """Where a ray between two others, which meet the raster at t `first` and `second`, meets it; −1: not near them."""
-    margin = 0.5 * abs(first - second) + 0.003 * first
-    t0, t1 = min(first, second) - margin, max(first, second) + margin
-    f0 = oz + t0 * dz - raster_height(s, ox + t0 * dx, oy + t0 * dy)
-    f1 = oz + t1 * dz - raster_height(s, ox + t1 * dx, oy + t1 * dy)
-    return _between(s, ox, oy, oz, dx, dy, dz, t0, t1, f0, f1) if f1 < 0.0 < f0 else -1.0
+def _approach(s: Surface, ox: float, oy: float, oz: float, w: F64) -> None:
+    """One step of Newton's for a chunk of rays towards the bilinear patch that each is over.
+
+    Only the loop that reads the raster is not made of vectors.
+    """
+    z = s.height
+    rows, columns = z.shape
+    x, y, east, north = ox - s.west, oy - s.south, columns - 1.001, rows - 1.001
+    for m in range(_CHUNK):
+        w[_U + m] = min(max((x + w[_T + m] * w[_DX + m]) * _PER_CELL, 0.0), east)
+        w[_V + m] = min(max((y + w[_T + m] * w[_DY + m]) * _PER_CELL, 0.0), north)
+    for m in range(_CHUNK):
+        i, j = int(w[_V + m]), int(w[_U + m])
+        w[_Z00 + m], w[_Z01 + m], w[_Z10 + m], w[_Z11 + m] = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
+    for m in range(_CHUNK):
+        fu, fv = w[_U + m] - np.floor(w[_U + m]), w[_V + m] - np.floor(w[_V + m])
+        to_east, to_north = w[_Z01 + m] - w[_Z00 + m], w[_Z10 + m] - w[_Z00 + m]
+        twist = w[_Z11 + m] - w[_Z10 + m] - to_east
+        above = oz + w[_T + m] * w[_DZ + m] - (w[_Z00 + m] + to_east * fu + (to_north + twist * fu) * fv)
+        rise = (to_east + twist * fv) * w[_DX + m] + (to_north + twist * fu) * w[_DY + m]
+        w[_STEP + m] = above / max(rise * _PER_CELL - w[_DZ + m], 0.05)
+        w[_T + m] += w[_STEP + m]
 
 
 @compiled
@@ -478,97 +548,131 @@ def _seen(
             (0.9 * z + 0.4 * y) * _PER_LEAF, lod + 0.3,
         )  # fmt: skip
         shade *= min(max(0.3 + 0.7 * leaf, 0.1), 2.0)
-        size = sway * leafy / 255.0
-        x += size * math.sin(2.1 * t_s + 0.5 * x + 0.3 * y)
-        y += size * math.sin(1.7 * t_s + 0.4 * y - 0.2 * x + 1.0)
+        if sway > 0.0:
+            size = sway * leafy / 255.0
+            x += size * math.sin(2.1 * t_s + 0.5 * x + 0.3 * y)
+            y += size * math.sin(1.7 * t_s + 0.4 * y - 0.2 * x + 1.0)
     r, g, b = raster_light(s, x, y, lod, footprint)
     return r * shade, g * shade, b * shade
 
 
 @compiled
-def render(
-    s: Surface, light: Light, rays: F32, R: F64, p: F64, block: int, pixel: float, row_s: float, t_s: float, pace: F64,
-    sway: float, blocks: I32, starts: F32, image: F32, depth: F32, what: I32,
-) -> None:  # fmt: skip
-    """Fill `image` (H, W, 3) with light BGR through the ideal rays (H, W, 2), each row of the camera at its own pose.
+def render(s: Surface, light: Light, view: View, sway: float, image: F32) -> None:
+    """Fill `image` (H, W, 3) with light BGR through the rays of a view; plants move by `sway` m in the wind."""
+    _prepare(s, view)
+    for sweep in range(len(_FAR)):
+        _sweep(s, view, _FAR[sweep], sweep > 0, (sweep + 1) % 2 > 0)
+    _shade(s, light, view, sway, image)
 
-    `R` (H, 3, 3) and `p` (H, 3) are the rows' `T_world_cam`; `depth` (H, W) gets z in the camera, m, `what` (H, W) the
-    solid and face. `pixel` is the width of a pixel at depth 1; rows are `row_s` apart, the middle one at `t_s`.
-    `blocks` (B, CANDIDATES + 2) and `starts` (B,) are room for what each block can meet. Where neighbours see
-    different things, four rays are averaged.
-    """
-    height, width, _ = image.shape
-    across = (width + block - 1) // block
-    for i0 in range(0, height, block):
-        i1 = min(i0 + block, height)
-        for j0 in range(0, width, block):
-            j1 = min(j0 + block, width)
+
+@compiled
+def _prepare(s: Surface, view: View) -> None:
+    """Find what each block of a view can meet."""
+    rays, R, p, pixel = view.rays, view.R, view.p, view.pixel
+    height, width, _ = rays.shape
+    n = 0
+    for i0 in range(0, height, BLOCK):
+        i1 = min(i0 + BLOCK, height)
+        for j0 in range(0, width, BLOCK):
+            j1 = min(j0 + BLOCK, width)
             im = (i0 + i1) // 2
-            n = i0 // block * across + j0 // block
-            found = blocks[n, 2:]
             rx = 0.5 * (rays[i0, j0, 0] + rays[i1 - 1, j1 - 1, 0])
             ry = 0.5 * (rays[i0, j0, 1] + rays[i1 - 1, j1 - 1, 1])
             dx, dy, dz = _turned(R, im, rx, ry)
-            spread = 0.75 * (block + 1) * pixel
-            start, kind, count = look_ahead(s, p[im, 0], p[im, 1], p[im, 2], dx, dy, dz, spread, found)
-            starts[n], blocks[n, 0], blocks[n, 1] = start, kind, count
-            guess = p[im, 2] + start * dz
-            # Every fourth row and column first; what is between two rays on the raster is found near them.
-            for sweep in range(5):
-                far, turn = (4, 2, 2, 1, 1)[sweep], (sweep + 1) % 2 if sweep else 0
-                begin_i, step_i = (i0 + far, 2 * far) if turn else (i0, 2 * far if sweep else 4)
-                begin_j, step_j = (j0, far) if turn or not sweep else (j0 + far, 2 * far)
-                for i in range(begin_i, i1, step_i):
-                    ox, oy, oz = p[i, 0], p[i, 1], p[i, 2]
-                    late = row_s * (i - 0.5 * (height - 1))
-                    for j in range(begin_j, j1, step_j):
-                        dx, dy, dz = _turned(R, i, rays[i, j, 0], rays[i, j, 1])
-                        t = -1.0
-                        if sweep:
-                            ia, ja = (i - far, j) if turn else (i, j - far)
-                            ib, jb = (i + far, j) if turn else (i, j + far)
-                            inner = ib < i1 and jb < j1
-                            first = depth[ia, ja]
-                            if what[ia, ja] == _RASTER and (not inner or what[ib, jb] == _RASTER):
-                                second = depth[ib, jb] if inner else _NEXT * first
-                                if kind == _ROUGH and abs(first - second) < _NEAR * first:
-                                    t = _next_to(s, ox, oy, oz, dx, dy, dz, first, second)
-                                elif kind == _SMOOTH and inner and far == 1:
-                                    t = 2.0 * first * second / (first + second)
-                        if t < 0.0:
-                            t = _on_raster(s, ox, oy, oz, dx, dy, dz, start, kind, guess)
-                        guess = oz + t * dz
-                        t, solid, face = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, late, pace)
-                        depth[i, j], what[i, j] = t, solid * 16 + face
+            spread = 0.75 * (BLOCK + 1) * pixel
+            start, kind, count = look_ahead(s, p[im, 0], p[im, 1], p[im, 2], dx, dy, dz, spread, view.blocks[n, 2:])
+            view.starts[n], view.blocks[n, 0], view.blocks[n, 1] = start, kind, count
+            n += 1
+
+
+@compiled
+def _sweep(s: Surface, view: View, far: int, between: bool, turn: bool) -> None:
+    """Trace the first rays, every `far` pixels, or those between two that are `far` left and right, or up and down.
+
+    Rays between two that meet the raster nearly as deep look for it there; they are moved chunk by chunk. Others look
+    for it from where their beam begins, or just before the nearer of the two.
+    """
+    rays, depth, what, w = view.rays, view.depth, view.what, view.chunk
+    height, width, _ = rays.shape
+    across = (width + BLOCK - 1) // BLOCK
+    turn = turn and between
+    begin_i, step_i = (far, 2 * far) if turn else (0, 2 * far if between else far)
+    begin_j, step_j = (0, far) if turn or not between else (far, 2 * far)
+    for i in range(begin_i, height, step_i):
+        ox, oy, oz = view.p[i, 0], view.p[i, 1], view.p[i, 2]
+        late, guess = view.row_s * (i - 0.5 * (height - 1)), 0.0
+        up, down = (i - far, i + far if i + far < height else i - far) if turn else (i, i)
+        for left in range(begin_j, width, step_j * _CHUNK):
+            length = min(_CHUNK, (width - left + step_j - 1) // step_j)
+            for m in range(length):
+                j = left + m * step_j
+                w[_DX + m], w[_DY + m], w[_DZ + m] = _turned(view.R, i, rays[i, j, 0], rays[i, j, 1])
+                w[_NEARBY + m] = -1.0
+                if between:
+                    ja, jb = (j, j) if turn else (j - far, j + far if j + far < width else j - far)
+                    first, second = depth[up, ja], depth[down, jb]
+                    gap = abs(first - second)
+                    w[_T + m] = w[_GUESS + m] = 0.5 * (first + second)
+                    if what[up, ja] == _RASTER and what[down, jb] == _RASTER:
+                        w[_NEARBY + m] = gap + 0.006 * first if gap < _NEAR * first else 0.0
+            if between:
+                _approach(s, ox, oy, oz, w)
+                _approach(s, ox, oy, oz, w)
+            for m in range(length):
+                j = left + m * step_j
+                n = i // BLOCK * across + j // BLOCK
+                begin, kind, count = view.starts[n], view.blocks[n, 0], view.blocks[n, 1]
+                dx, dy, dz, t = w[_DX + m], w[_DY + m], w[_DZ + m], w[_T + m]
+                # Steps more than double the digits: after a small one nothing is left to do.
+                lost = abs(t - w[_GUESS + m]) > w[_NEARBY + m] or abs(w[_STEP + m]) > 1e-4 * t
+                if w[_NEARBY + m] < 0.0 or lost or kind == _EMPTY:
+                    if w[_NEARBY + m] >= 0.0:
+                        ja, jb = (j, j) if turn else (j - far, j + far if j + far < width else j - far)
+                        near = (1.0 - 0.5 * _NEAR) * min(depth[up, ja], depth[down, jb])
+                        if near > begin and oz + near * dz > raster_height(s, ox + near * dx, oy + near * dy):
+                            begin = near
+                    t = _on_raster(s, ox, oy, oz, dx, dy, dz, begin, kind, guess)
+                guess = oz + t * dz
+                t, solid, face = _before(
+                    s, t, ox, oy, oz, dx, dy, dz, view.blocks[n, 2:], count, late, view.pace
+                )  # fmt: skip
+                depth[i, j], what[i, j] = t, solid * 16 + face
+
+
+@compiled
+def _shade(s: Surface, light: Light, view: View, sway: float, image: F32) -> None:
+    """Fill `image` with the light of what the rays of a view met; four rays where neighbours see different things."""
+    rays, R, pixel, pace, depth, what = view.rays, view.R, view.pixel, view.pace, view.depth, view.what
+    height, width, _ = rays.shape
+    across, lod = (width + BLOCK - 1) // BLOCK, 0.0
     for i in range(height):
-        ox, oy, oz = p[i, 0], p[i, 1], p[i, 2]
-        late = row_s * (i - 0.5 * (height - 1))
+        ox, oy, oz = view.p[i, 0], view.p[i, 1], view.p[i, 2]
+        late = view.row_s * (i - 0.5 * (height - 1))
+        t_s = view.t_s + late
+        up, down = max(i - 1, 0), min(i + 1, height - 1)
         for j in range(width):
-            n = i // block * across + j // block
-            kind, count, found = blocks[n, 0], blocks[n, 1], blocks[n, 2:]
-            t, w = depth[i, j], what[i, j]
-            if j % block == 0:
+            n = i // BLOCK * across + j // BLOCK
+            kind, count, found = view.blocks[n, 0], view.blocks[n, 1], view.blocks[n, 2:]
+            t, w, left, right = depth[i, j], what[i, j], max(j - 1, 0), min(j + 1, width - 1)
+            if j % BLOCK == 0:
                 lod = math.log2(max(1.15 * t * pixel / s.texel, 1e-3))
-            i_up, i_down, j_left, j_right = max(i - 1, 0), min(i + 1, height - 1), max(j - 1, 0), min(j + 1, width - 1)
-            same = what[i_up, j] == w and what[i_down, j] == w and what[i, j_left] == w and what[i, j_right] == w
-            if same:
+            if what[up, j] == w and what[down, j] == w and what[i, left] == w and what[i, right] == w:
                 dx, dy, dz = _turned(R, i, rays[i, j, 0], rays[i, j, 1])
                 r, g, b = _seen(
-                    s, light, t, w >> 4, w & 15, ox, oy, oz, dx, dy, dz, pixel, lod, found, count, late, pace,
-                    t_s + late, sway,
-                )  # fmt: skip
+                    s, light, t, w >> 4, w & 15, ox, oy, oz, dx, dy, dz, pixel, lod, found, count, late, pace, t_s, sway
+                )
             else:
                 r, g, b = 0.0, 0.0, 0.0
                 fu, fv = -0.125 * pixel, -0.375 * pixel
                 for _ in range(4):
                     fu, fv = -fv, fu  # a turned square: four different rows and columns
                     dx, dy, dz = _turned(R, i, rays[i, j, 0] + fu, rays[i, j, 1] + fv)
-                    t = _on_raster(s, ox, oy, oz, dx, dy, dz, starts[n], kind, oz + depth[i, j] * dz)
+                    t = _on_raster(s, ox, oy, oz, dx, dy, dz, view.starts[n], kind, oz + depth[i, j] * dz)
                     t, solid, face = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, late, pace)
                     fine = math.log2(max(1.15 * t * pixel / s.texel, 1e-3))
                     r1, g1, b1 = _seen(
-                        s, light, t, solid, face, ox, oy, oz, dx, dy, dz, pixel, fine, found, count, late, pace,
-                        t_s + late, sway,
+                        s, light, t, solid, face, ox, oy, oz, dx, dy, dz, pixel, fine, found, count, late, pace, t_s,
+                        sway,
                     )  # fmt: skip
                     r, g, b = r + 0.25 * r1, g + 0.25 * g1, b + 0.25 * b1
             image[i, j, 0], image[i, j, 1], image[i, j, 2] = b, g, r
