@@ -44,7 +44,6 @@ def _parser() -> argparse.ArgumentParser:
     process = commands.add_parser("process", help="map a recorded or simulated flight in one go and write files")
     process.add_argument("source", metavar="SOURCE", help="photos:DIR or sim:survey?seed=1&photos=60")
     process.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
-    process.add_argument("--quiet", action="store_true", help="no progress bar")
     process.set_defaults(run=_process)
 
     run = commands.add_parser("run", help="fly: map a source as it comes and send the map to the ground")
@@ -54,7 +53,6 @@ def _parser() -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="tell what is in a source: streams, counts, rates, gaps, faults")
     info.add_argument("source", metavar="SOURCE", help="e.g. ubx:F, euroc:DIR, gopro:F, ulog:F, bag:F or F.mcap")
     info.add_argument("--json", action="store_true", help="for programs, instead of a table")
-    info.add_argument("--quiet", action="store_true", help="no progress bar")
     info.set_defaults(run=_info)
 
     position = commands.add_parser("position", help="position and velocity of each GNSS epoch of a source, as a table")
@@ -63,14 +61,12 @@ def _parser() -> argparse.ArgumentParser:
     position.add_argument("--systems", default="GREJC", metavar="GREJC", help="GNSS to use, letters as in RINEX")
     position.add_argument("--mask", type=float, default=10.0, metavar="DEG", help="least elevation of a satellite")
     position.add_argument("--dual", action="store_true", help="remove the ionosphere by a second band")
-    position.add_argument("--quiet", action="store_true", help="no progress bar")
     position.set_defaults(run=_position)
 
     odometry = commands.add_parser("odometry", help="trajectory of a flight with a camera and an IMU, as files")
     odometry.add_argument("source", metavar="SOURCE", help="with frames and IMU samples, e.g. euroc:DIR or F.mcap")
     odometry.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     odometry.add_argument("--calibration", type=Path, metavar="F", help="of the camera, where the source has none")
-    odometry.add_argument("--quiet", action="store_true", help="no progress bar")
     odometry.set_defaults(run=_odometry)
 
     record = commands.add_parser("record", help="record everything on the bus into a file until it is stopped")
@@ -83,14 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--start", type=float, default=0.0, metavar="s", help="seconds from the start of the recording")
     replay.add_argument("--end", type=float, default=float("inf"), metavar="s", help="seconds from its start")
     replay.add_argument("--loop", action="store_true", help="begin again after the end")
-    replay.add_argument("--quiet", action="store_true", help="no progress bar")
     replay.set_defaults(run=_replay)
 
     simulate = commands.add_parser("simulate", help="record a simulated flight as fast as it computes")
     simulate.add_argument("source", metavar="URL", help="e.g. sim:playground?seed=1&duration=300&gnss.multipath=0")
     simulate.add_argument("--out", type=Path, required=True, metavar="F.mcap", help="the recording")
     simulate.add_argument("--truth", type=Path, metavar="DIR", help="folder for the truth as files")
-    simulate.add_argument("--quiet", action="store_true", help="no progress bar")
     simulate.set_defaults(run=_simulate)
 
     convert = commands.add_parser("convert", help="write a flight in the formats of other programs")
@@ -98,7 +92,6 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--to", required=True, metavar="euroc+rinex", help="formats: euroc, rinex, or both")
     convert.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     convert.add_argument("--calibration", type=Path, metavar="DIR", help="what simulate wrote beside its recording")
-    convert.add_argument("--quiet", action="store_true", help="no progress bar")
     convert.set_defaults(run=_convert)
 
     check = commands.add_parser("check", help="find the devices and show how each is doing")
@@ -108,6 +101,8 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_calibrate(commands.add_parser("calibrate", help="calibrate a camera, or a camera against the IMU"))
 
+    for command in (process, info, position, odometry, replay, simulate, convert):
+        command.add_argument("--quiet", action="store_true", help="no progress bar")
     for command in (check, process, run, record, replay, simulate):
         command.add_argument("--config", type=Path, metavar="FILE", help="TOML file; without it the defaults hold")
     return parser
