@@ -104,7 +104,7 @@ def test_a_known_speed_tells_the_scale_of_steady_flight(seed: int) -> None:
     picked = frames[3:24:2]
     truth = scene.state(picked[0].t_ns)
     speed = KnownSpeed(picked[0].t_ns, float(np.linalg.norm(truth.v_world)), 0.1)
-    initial = initial_in_motion(picked, buffer, T_BODY_CAM, CAMERA.fx, SETTINGS, IMU, speed)
+    initial = initial_in_motion(picked, buffer, T_BODY_CAM, CAMERA.fx, SETTINGS, IMU, [speed])
     assert isinstance(initial, Initial)
     last, true_last = initial.states[-1], scene.state(picked[-1].t_ns)
     assert np.linalg.norm(last.v_world) == pytest.approx(np.linalg.norm(true_last.v_world), abs=0.5)

@@ -12,8 +12,6 @@ from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import TrackedFrame
 from common.se3 import SE3
 
-NEAR_NS = 300_000_000
-
 
 class Initialization:
     """Collects frames and tries, after each, to begin at rest, and every few frames to begin in motion."""
@@ -56,6 +54,6 @@ class Initialization:
             return Refusal("too few frames were seen so far")
         chosen = np.unique(np.round(np.linspace(0, len(frames) - 1, s.frames)).astype(int)).tolist()
         picked = [frames[i] for i in chosen]
-        near = [v for v in self._speeds if abs(v.t_ns - picked[0].t_ns) < NEAR_NS]
-        speed = min(near, key=lambda v: abs(v.t_ns - picked[0].t_ns)) if near else None
-        return initial_in_motion(picked, self._buffer, self._T_body_cam, self._focal, s, self.settings.imu, speed)
+        return initial_in_motion(
+            picked, self._buffer, self._T_body_cam, self._focal, s, self.settings.imu, self._speeds
+        )
