@@ -3,7 +3,7 @@
 A rover flies circles at 3 m/s, 40 m up, some 190 m from a base station. RTKLIB's rnx2rtkp gets the exported RINEX:
 single points with one band, broadcast ionosphere and Saastamoinen, elevation mask 10°, all systems; carrier phase
 (GPS, Galileo, GLONASS in two bands, mask 15°) epoch by epoch, without holding ambiguities. Of the wet delay between
-rover and base, 40 m apart in height, RTKLIB knows nothing: 6 mm.
+rover and base, 40 m apart in height, RTKLIB knows nothing: 6 mm. "Ours" are our own single points of the same epochs.
 
 python tests/benchmarks/bench_gnss_simulator.py
 """
@@ -21,12 +21,30 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import rtklib
-from gnss_scene import BASE_ECEF, circling, circling_low, correlation_time, exported, rover
+from gnss_scene import (
+    BASE_ECEF,
+    DATUM,
+    T_ECEF_WORLD,
+    circling,
+    circling_low,
+    correlation_time,
+    exported,
+    rover,
+)
 
+from air.gnss.ephemerides import Ephemerides
+from air.gnss.positioning import PointPosition, find_position
+from air.gnss.settings import PositioningSettings
+from air.sensors.gnss_ublox import UbloxReceiver
+from air.sources.rinex import open_rinex
 from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.survey import START_NS
+from common.geo import geodetic_to_enu
+from common.measurements import ReceiverSolution
 
 SEEDS = (1, 2, 3)
 DURATION_S = 1200.0
+OWN_SEEDS, OWN_S = (1, 2, 3, 4, 5), 240.0
 PERFECT, DEFAULT = GnssOptions.perfect(), GnssOptions()
 ALONE = {
     "none": (),
@@ -42,6 +60,7 @@ ALONE = {
 def main():
     """Print the tables."""
     speed()
+    own_solutions()
     if shutil.which("rnx2rtkp") is None:
         print("\nskipped: RTKLIB's rnx2rtkp is not installed (Debian: apt install rtklib)")
         return
@@ -64,22 +83,51 @@ def speed():
         print(f"| {name} ({count / duration_s:.0f} a second) | {spent:.1f} | < 50 |", flush=True)
 
 
+def own_solutions():
+    """Errors of what the receiver itself says, in its NAV-PVT."""
+    print("\n| the receiver's own solution | horizontal, median, m | vertical RMS, m | target |\n|---|---|---|---|")
+    first, later = [], []
+    for seed in tqdm(OWN_SEEDS, leave=False, disable=None):
+        driver, errors = UbloxReceiver(), []
+        for _, data in rover(replace(DEFAULT, rate_hz=5.0), OWN_S, seed).packets():
+            for told in driver.feed(data, 0):
+                if isinstance(told, ReceiverSolution):
+                    p_world = geodetic_to_enu(DATUM, told.latitude_deg, told.longitude_deg, told.height)
+                    truth, _ = circling(np.array([(told.t_ns - START_NS) / 1e9]))
+                    errors.append(p_world - T_ECEF_WORLD.inverse().apply(truth[0]))
+        first.append(errors[0])
+        later += errors
+    for name, found in (("first fix", first), (f"{OWN_S:.0f} s", later)):
+        east, north, up = np.array(found).T
+        middle, rms = np.median(np.hypot(east, north)), np.sqrt(np.mean(up**2))
+        print(
+            f"| {name}, seeds {OWN_SEEDS[0]} to {OWN_SEEDS[-1]} | {middle:.2f} | {rms:.2f} | 1.5 m class |", flush=True
+        )
+
+
 def single_points(folder):
-    """Errors of RTKLIB's single points, with one error at a time."""
-    print("\n| errors that are on | horizontal RMS, m | vertical RMS, m | correlated over, s | positions |")
-    print("|---|---|---|---|---|")
+    """Errors of RTKLIB's single points and of ours, with one error at a time."""
+    print("\n| errors that are on | horizontal RMS, m | vertical RMS, m | correlated over, s | positions | ours, m |")
+    print("|---|---|---|---|---|---|")
     for name, on in tqdm(ALONE.items(), leave=False, disable=None):
         options = replace(PERFECT, **{key: getattr(DEFAULT, key) for key in on} | {"rate_hz": 0.5, "missing": 0.0})
-        errors, epochs = [], 0
+        errors, ours, epochs = [], [], 0
         for seed in SEEDS:
             flight = exported(folder, options, None, DURATION_S, seed)
+            known = Ephemerides(open_rinex(f"rinex:{flight.nav}", str(flight.nav)))
+            fixes = [find_position(o.epoch, known, PositioningSettings()) for o in flight.observed]
+            fixes = [fix for fix in fixes if isinstance(fix, PointPosition)]
+            true_ns = (fix.t_ns - round(next(iter(fix.clocks.values())) * 1e9) for fix in fixes)
+            ours.append(flight.errors(true_ns, (fix.position for fix in fixes)))
             found = rtklib.single_point(folder, flight.rover, flight.nav, "GREC", 10.0)
             errors.append(flight.errors((s.t_ns for s in found), (s.position for s in found)))
             epochs += len(flight.observed)
         rms = np.sqrt(np.mean(np.square(np.concatenate(errors)), axis=0))
+        own = np.sqrt(np.mean(np.square(np.concatenate(ours)), axis=0))
         seconds = np.median([correlation_time(e[:, axis], 2.0) for e in errors for axis in range(3)])
         given = sum(map(len, errors)) / epochs
-        print(f"| {name} | {np.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {seconds:.0f} | {given:.1%} |", flush=True)
+        cells = f"{np.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {seconds:.0f} | {given:.1%}"
+        print(f"| {name} | {cells} | {np.hypot(*own[:2]):.2f}, {own[2]:.2f} |", flush=True)
 
 
 def carrier_phases(folder):
