@@ -32,11 +32,24 @@ from air.sources.source import open_source
 from common.arrays import F64
 from common.errors import ConfigError
 from common.geo import ecef_to_geodetic, geodetic_to_ecef
-from common.measurements import Ephemeris, GnssEpoch, KeplerEphemeris
+from common.measurements import Ephemeris, GnssEpoch, Ionosphere, KeplerEphemeris
 
 NOON_NS = from_week(2320, 129_600.0)
 SIGNALS = {"G": ("1C", "2W"), "E": ("1C", "7Q")}
 SETTINGS = PositioningSettings(systems="GE")
+
+
+def test_beidou_s_ionosphere_is_that_of_gps_told_otherwise() -> None:
+    """Both of 2021-10-31, over England, are 0.3 m apart, of 4 m; BeiDou's numbers in GPS's formula are not."""
+    gps = Ionosphere(0, "G", (1.2107e-8, 0.0, -1.19209e-7, 0.0), (94_208.0, 0.0, -196_608.0, 0.0))
+    alpha, beta = (1.490116e-8, 7.45058e-8, -8.34465e-7, 1.430511e-6), (131_072.0, -262_144.0, -262_144.0, 1_179_648.0)
+    place, south, angle = np.array([*np.radians([51.76, -1.26]), 100.0]), np.array([np.pi]), np.radians([30.0])
+    told, by_beidou, misread = (
+        klobuchar(model, from_week(2181, 15 * 3600.0), place, south, angle)[0][0]
+        for model in (gps, Ionosphere(0, "C", alpha, beta), Ionosphere(0, "G", alpha, beta))
+    )
+    assert told == pytest.approx(4.0, abs=0.2)
+    assert abs(by_beidou - told) < 0.3 < abs(misread - told)
 
 
 def constellation() -> list[KeplerEphemeris]:

@@ -254,7 +254,7 @@ def test_the_driver_gives_back_the_same_measurements_and_ephemerides() -> None:
     for message in heard:
         assert message == replace(sent[message.satellite, message.toe_ns], t_ns=message.t_ns)
     (model,) = {replace(m, t_ns=0) for m in found if isinstance(m, Ionosphere)}
-    assert (model.alpha, model.beta) == (above.constellation.ionosphere.alpha, above.constellation.ionosphere.beta)
+    assert model == replace(above.constellation.beidou_ionosphere, t_ns=0)
 
 
 def test_the_ionosphere_of_gps_comes_with_its_page() -> None:

@@ -59,7 +59,7 @@ class Ephemerides:
         return None
 
     def ionosphere(self) -> Ionosphere | None:
-        """Klobuchar's model as broadcast, of GPS if there is one."""
+        """The model as broadcast, of GPS if there is one, else of QZSS or BeiDou."""
         return next((self._ionosphere[system] for system in "GJC" if system in self._ionosphere), None)
 
 

@@ -69,7 +69,7 @@ class Broadcast:
                 yield _piece(t_ns, after_s, 2, NavigationBits(satellite, "1B", 0, page))
         else:
             step_s, length_s = (3.0, 0.6) if is_geostationary(satellite) else (6.0, 6.0)
-            subframes = beidou_d1_d2.ephemeris_words(eph, self._constellation.ionosphere, t_ns)
+            subframes = beidou_d1_d2.ephemeris_words(eph, self._constellation.beidou_ionosphere, t_ns)
             for i, words in enumerate(subframes):
                 yield _piece(t_ns, step_s * i, length_s, NavigationBits(satellite, "2I", 0, words))
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
+from air.gnss.atmosphere import B1I_HZ, L1_HZ
 from air.gnss.calendar import leap_seconds, to_calendar
 from air.gnss.ephemerides import is_healthy
 from air.gnss.gnss_time import BEIDOU_EPOCH_NS, GPS_EPOCH_NS, SECOND_NS, WEEK_NS
@@ -21,6 +22,7 @@ from air.gnss.orbit import MU, RATE, is_geostationary, states_at
 from air.sources.rinex import open_rinex
 from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.gnss.nominal_orbits import nominal, wrapped
+from common.arrays import F64
 from common.errors import SourceError
 from common.measurements import Ephemeris, GlonassEphemeris, Ionosphere, KeplerEphemeris
 
@@ -34,6 +36,8 @@ IONOSPHERE = Ionosphere(
 )
 """Close to GPS's broadcast of 2004-01-01, in whole units of the message."""
 
+_GEOMAGNETIC_SHIFT = -0.064
+"""By so much geomagnetic latitudes are less than geographic ones in East Asia, semicircles."""
 _PERIOD_S = {"G": 7200, "E": 600, "C": 3600, "R": 1800}
 _LEAD_S = {"G": 7200, "E": -600, "C": 0, "R": 900}
 """How often a satellite begins a new issue, and how far its reference time lies ahead of that beginning."""
@@ -46,7 +50,7 @@ class Constellation:
     """N satellites in order of their names. `reference` holds the orbit that each really flies."""
 
     def __init__(self, orbits: Iterable[Ephemeris], ionosphere: Ionosphere, start_ns: int, seed: int):
-        self.ionosphere = ionosphere
+        self.ionosphere, self.beidou_ionosphere = ionosphere, told_by_beidou(ionosphere)
         self.leap_s = leap_seconds(to_calendar(start_ns))
         by_name = {orbit.satellite: orbit for orbit in orbits}
         uploads = np.random.default_rng([seed, _CONSTELLATION, 1]).integers(0, 5 * _PERIOD_S["G"] // _PHASE_STEP_S, 64)
@@ -121,7 +125,7 @@ class Constellation:
             words = map(inav.word, inav.pages(orbit, t_ns))
             found = inav.ephemeris([bits or 0 for bits in words], name, t_ns)
         else:
-            subframes = map(beidou_d1_d2.subframe, beidou_d1_d2.ephemeris_words(orbit, self.ionosphere, t_ns))
+            subframes = map(beidou_d1_d2.subframe, beidou_d1_d2.ephemeris_words(orbit, self.beidou_ionosphere, t_ns))
             both = beidou_d1_d2.ephemeris([bits or 0 for bits in subframes], name, t_ns)
             found = both[0] if both else None
         if found is None:
@@ -146,6 +150,25 @@ def constellation(options: GnssOptions, start_ns: int, seed: int) -> Constellati
     if not flying.satellites:
         raise SourceError(f"option 'nav': {options.nav!r} holds no usable ephemeris of the systems {options.systems}")
     return flying
+
+
+def told_by_beidou(model: Ionosphere) -> Ionosphere:
+    """GPS's ionosphere as BeiDou tells it over East Asia: by geographic latitude, at B1I, rounded as its message does.
+
+    That is north of the equator; elsewhere both constellations differ, as they do in the real sky.
+    """
+    geomagnetic = np.polynomial.Polynomial([_GEOMAGNETIC_SHIFT, 1.0])
+    scale = (L1_HZ / B1I_HZ) ** 2
+
+    def moved(values: tuple[float, ...], times: float, units: tuple[int, ...]) -> tuple[float, float, float, float]:
+        coefficients: F64 = np.pad(np.polynomial.Polynomial(values)(geomagnetic).coef, (0, 4))[:4].astype(float)
+        steps = 2.0 ** np.array(units)
+        a, b, c, d = (np.clip(np.rint(times * coefficients / steps), -128, 127) * steps).tolist()
+        return a, b, c, d
+
+    return Ionosphere(
+        model.t_ns, "C", moved(model.alpha, scale, (-30, -27, -24, -24)), moved(model.beta, 1.0, (11, 14, 16, 16))
+    )
 
 
 def from_navigation(path: Path, start_ns: int) -> list[Ephemeris | Ionosphere]:
