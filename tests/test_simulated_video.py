@@ -110,6 +110,24 @@ def test_the_outline_of_a_roof_is_where_its_corners_project() -> None:
     assert wrong.sum() < 0.02 * len(np.argwhere((expected > 0) & (expected < 1)))
 
 
+@pytest.mark.parametrize("height", [12.0, 60.0, 180.0])
+def test_from_any_height_each_pixel_meets_what_its_own_ray_meets(height) -> None:
+    # So few pixels that the beam of a block is metres wide, far wider than a cell of the index.
+    places = np.random.default_rng(3).uniform(-28, 28, (40, 2))
+    boxes = tuple(Box(x, y, 0.3 * n, 1.5, 1.5, 2.0 + 0.2 * n) for n, (x, y) in enumerate(places))
+    site = fiducial_site(np.zeros((0, 2)), boxes=boxes)
+    above = Gliding(np.array([3.0, -2.0, height]), np.zeros(3), np.zeros(3))
+    cam = camera(site, above, replace(PERFECT, width=128, height=72))
+    poses = cam.poses(0.5)
+    cam.look(poses)
+    R, p = poses.R_world_cam[36], poses.p_world[36]
+    rays = np.concatenate([cam._rays, np.ones((72, 128, 1))], axis=-1).reshape(-1, 3) @ R.T
+    met, solid = site.intersect(p, rays)
+    assert np.count_nonzero(solid >= 0) > 3
+    assert np.array_equal(cam._what.ravel() >> 4, solid)
+    assert np.abs(cam._depth.ravel() - (met - p) @ R[:, 2]).max() < 1e-3 * height
+
+
 def test_the_same_frames_come_every_time(ground) -> None:
     options = CameraOptions(rate_hz=4.0, width=320, height=180)
     first, again = (list(camera(ground, FAST, options).frames()) for _ in range(2))

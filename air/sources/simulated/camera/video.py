@@ -150,6 +150,7 @@ class SimulatedCamera:
         self._blocks: I32 = np.empty((blocks, raycast.CANDIDATES + 2), np.int32)
         self._starts: F32 = np.empty(len(self._blocks), np.float32)
         self._chunk: F64 = np.zeros(raycast.CHUNK_ROOM)
+        self._texels: raycast.U64 = np.zeros(raycast.TEXEL_ROOM, np.uint64)
         self._normals = np.random.default_rng([seed, _NOISE]).standard_normal(_NORMALS + 3 * width, np.float32)
 
     @property
@@ -216,7 +217,7 @@ class SimulatedCamera:
         view = raycast.View(
             self._rays, np.ascontiguousarray(poses.R_world_cam), np.ascontiguousarray(poses.p_world),
             1 / self.model.fx, self.line_time_s, poses.t_s, pace, self._depth, self._what, self._blocks, self._starts,
-            self._chunk,
+            self._chunk, self._texels,
         )  # fmt: skip
         raycast.render(surface, self._site.light, view, self._site.sway, self._light)
         return self._light

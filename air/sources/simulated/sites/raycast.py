@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from air.sources.simulated.sites.raytrace import compiled, enter_house
 from air.sources.simulated.sites.scene import EAST_WALL, GROUND, NORTH_ROOF, NORTH_WALL, SOUTH_ROOF, WEST_WALL, Light
@@ -31,6 +32,8 @@ from air.sources.simulated.sites.surface import (
 )
 from common.arrays import F32, F64, I32, U8, Bool
 
+U64 = npt.NDArray[np.uint64]
+
 WATER, SKY = -2, -3
 """What a ray meets beside solids (from 0 on) and the raster (−1)."""
 CANDIDATES = 96
@@ -40,8 +43,12 @@ BLOCK = 8
 _CHUNK = 32
 """Rays of a row that one step of Newton's moves at once: what fits vectors of any processor."""
 _T, _DX, _DY, _DZ, _U, _V, _Z00, _Z01, _Z10, _Z11, _STEP, _GUESS, _NEARBY = range(0, 13 * _CHUNK, _CHUNK)
-CHUNK_ROOM = 13 * _CHUNK
-"""Numbers that a chunk of rays needs room for."""
+_X, _Y, _Z, _AT, _FU, _FV, _PER, _SHIFT, _EAST, _NORTH, _ROW, _BEGIN, _REST, _SHADE, _R, _G, _B = range(
+    0, 17 * _CHUNK, _CHUNK
+)
+_C00, _C01, _C10, _C11, _FINE, _COARSE = range(0, 6 * _CHUNK, _CHUNK)
+CHUNK_ROOM, TEXEL_ROOM = 17 * _CHUNK, 6 * _CHUNK
+"""Numbers and texels that a chunk of rays needs room for."""
 _FAR = (8, 4, 4, 2, 2, 1, 1)
 """How far, in pixels, the rays of each sweep are from the two that they are between: left and right, or up and down."""
 _SMOOTH, _ROUGH, _EMPTY = 0, 1, 2
@@ -56,6 +63,7 @@ _PER_CELL = 1.0 / CELL
 _PER_LEAF = 50.0
 _FINEST = 0.05
 """Pixels of this width, m, no longer see the finest detail."""
+_ONE = np.uint64(1)
 _LOW, _BLUE, _GREEN, _STRENGTH = np.uint64(0xFFFF), np.uint64(16), np.uint64(32), np.uint64(48)
 
 
@@ -64,8 +72,8 @@ class View(NamedTuple):
 
     `rays` (H, W, 2) at depth 1, `R` (H, 3, 3) and `p` (H, 3) m the rows' `T_world_cam`, `pixel` the width of a pixel at
     depth 1; rows are `row_s` apart, the middle one at `t_s`; moving solids go `pace` (K, 2) m/s. `depth` (H, W) gets
-    z in the camera, m, `what` (H, W) the solid and face. `blocks` (B, CANDIDATES + 2), `starts` (B,) and `chunk`
-    (CHUNK_ROOM,) are room for what each block can meet and for a chunk of rays.
+    z in the camera, m, `what` (H, W) the solid and face. `blocks` (B, CANDIDATES + 2), `starts` (B,), `chunk`
+    (CHUNK_ROOM,) and `texels` (TEXEL_ROOM,) are room for what each block can meet and for a chunk of rays.
     """
 
     rays: F32
@@ -80,6 +88,7 @@ class View(NamedTuple):
     blocks: I32
     starts: F32
     chunk: F64
+    texels: U64
 
 
 @compiled
@@ -88,11 +97,10 @@ def raster_height(s: Surface, x: float, y: float) -> float:
     h, w = s.height.shape
     u = min(max((x - s.west) * _PER_CELL, 0.0), w - 1.001)
     v = min(max((y - s.south) * _PER_CELL, 0.0), h - 1.001)
-    i, j = int(v), int(u)
+    i, j, z = np.uint64(v), np.uint64(u), s.height  # numbers that count from the end would have to be looked for
     fu, fv = u - j, v - i
-    z = s.height
-    low = z[i, j] + (z[i, j + 1] - z[i, j]) * fu
-    high = z[i + 1, j] + (z[i + 1, j + 1] - z[i + 1, j]) * fu
+    low = z[i, j] + (z[i, j + _ONE] - z[i, j]) * fu
+    high = z[i + _ONE, j] + (z[i + _ONE, j + _ONE] - z[i + _ONE, j]) * fu
     return float(low + (high - low) * fv)
 
 
@@ -292,8 +300,9 @@ def _approach(s: Surface, ox: float, oy: float, oz: float, w: F64) -> None:
         w[_U + m] = min(max((x + w[_T + m] * w[_DX + m]) * _PER_CELL, 0.0), east)
         w[_V + m] = min(max((y + w[_T + m] * w[_DY + m]) * _PER_CELL, 0.0), north)
     for m in range(_CHUNK):
-        i, j = int(w[_V + m]), int(w[_U + m])
-        w[_Z00 + m], w[_Z01 + m], w[_Z10 + m], w[_Z11 + m] = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
+        i, j = np.uint64(w[_V + m]), np.uint64(w[_U + m])
+        w[_Z00 + m], w[_Z01 + m] = z[i, j], z[i, j + _ONE]
+        w[_Z10 + m], w[_Z11 + m] = z[i + _ONE, j], z[i + _ONE, j + _ONE]
     for m in range(_CHUNK):
         fu, fv = w[_U + m] - np.floor(w[_U + m]), w[_V + m] - np.floor(w[_V + m])
         to_east, to_north = w[_Z01 + m] - w[_Z00 + m], w[_Z10 + m] - w[_Z00 + m]
@@ -376,11 +385,11 @@ def _spread(texel: int) -> int:
 def _periodic(texture: U8, begin: int, size: int, u: float, v: float) -> float:
     """Value of a level of a periodic texture of `size` (a power of two) texels a side, bilinear; 1 on average."""
     fu, fv = math.floor(u), math.floor(v)
-    n = size - 1
-    j, i = int(fu) & n, int(fv) & n
-    j1, i1 = (j + 1) & n, (i + 1) & n
+    n = np.uint64(size - 1)
+    j, i = np.uint64(np.int64(fu)) & n, np.uint64(np.int64(fv)) & n
+    j1, i1 = (j + _ONE) & n, (i + _ONE) & n
     u, v = u - fu, v - fv
-    a, b = begin + i * size, begin + i1 * size
+    a, b = np.uint64(begin) + i * np.uint64(size), np.uint64(begin) + i1 * np.uint64(size)
     low = texture[a + j] * (1.0 - u) + texture[a + j1] * u
     high = texture[b + j] * (1.0 - u) + texture[b + j1] * u
     return float(low * (1.0 - v) + high * v) / 128.0
@@ -513,6 +522,30 @@ def _water_light(
 
 
 @compiled
+def _leafy(s: Surface, x: float, y: float) -> int:
+    """How much of a plant the raster is at (x, y), 0 to 255."""
+    h, w = s.sway.shape
+    i = np.uint64(min(max((y - s.south) * _PER_CELL, 0.0), h - 1.0))
+    j = np.uint64(min(max((x - s.west) * _PER_CELL, 0.0), w - 1.0))
+    return int(s.sway[i, j])
+
+
+@compiled
+def _leaf(s: Surface, x: float, y: float, z: float, lod: float) -> float:
+    """Factor on the light of a plant at a point: leaves break up texture drawn out on the sides of crowns."""
+    u, v = (x - 0.6 * y + 0.3 * z) * _PER_LEAF, (0.9 * z + 0.4 * y) * _PER_LEAF
+    leaf = _pyramid_texel(s.detail, 0, DETAIL_TEXELS, DETAIL_MIPS, u, v, lod + 0.3)
+    return min(max(0.3 + 0.7 * leaf, 0.1), 2.0)
+
+
+@compiled
+def _blown(x: float, y: float, size: float, t_s: float) -> tuple[float, float]:
+    """Where what is seen at (x, y) stands in still air."""
+    x += size * math.sin(2.1 * t_s + 0.5 * x + 0.3 * y)
+    return x, y + size * math.sin(1.7 * t_s + 0.4 * y - 0.2 * x + 1.0)
+
+
+@compiled
 def _seen(
     s: Surface, light: Light, t: float, solid: int, face: int, ox: float, oy: float, oz: float, dx: float, dy: float,
     dz: float, pixel: float, lod: float, found: I32, count: int, late: float, pace: F64, t_s: float, sway: float,
@@ -536,22 +569,11 @@ def _seen(
             hit, _ = enter_house(s.solids, k, px, py, oz + t * dz + 0.02, sun[0], sun[1], sun[2])
             if 0.0 < hit < 50.0:
                 shade = 0.3
-    h, w = s.sway.shape
-    leafy = s.sway[
-        int(min(max((y - s.south) * _PER_CELL, 0.0), h - 1.0)), int(min(max((x - s.west) * _PER_CELL, 0.0), w - 1.0))
-    ]
+    leafy = _leafy(s, x, y)
     if leafy > 0:
-        z = oz + t * dz
-        # The texture is drawn out on the sides of crowns: leaves across them break it up.
-        leaf = _pyramid_texel(
-            s.detail, 0, DETAIL_TEXELS, DETAIL_MIPS, (x - 0.6 * y + 0.3 * z) * _PER_LEAF,
-            (0.9 * z + 0.4 * y) * _PER_LEAF, lod + 0.3,
-        )  # fmt: skip
-        shade *= min(max(0.3 + 0.7 * leaf, 0.1), 2.0)
+        shade *= _leaf(s, x, y, oz + t * dz, lod)
         if sway > 0.0:
-            size = sway * leafy / 255.0
-            x += size * math.sin(2.1 * t_s + 0.5 * x + 0.3 * y)
-            y += size * math.sin(1.7 * t_s + 0.4 * y - 0.2 * x + 1.0)
+            x, y = _blown(x, y, sway * leafy / 255.0, t_s)
     r, g, b = raster_light(s, x, y, lod, footprint)
     return r * shade, g * shade, b * shade
 
@@ -604,8 +626,8 @@ def _sweep(s: Surface, view: View, far: int, between: bool, turn: bool) -> None:
         up, down = (i - far, i + far if i + far < height else i - far) if turn else (i, i)
         for left in range(begin_j, width, step_j * _CHUNK):
             length = min(_CHUNK, (width - left + step_j - 1) // step_j)
-            for m in range(length):
-                j = left + m * step_j
+            for m in range(_CHUNK):
+                j = left + min(m, length - 1) * step_j  # what is beyond the row shall not run away
                 w[_DX + m], w[_DY + m], w[_DZ + m] = _turned(view.R, i, rays[i, j, 0], rays[i, j, 1])
                 w[_NEARBY + m] = -1.0
                 if between:
@@ -616,8 +638,8 @@ def _sweep(s: Surface, view: View, far: int, between: bool, turn: bool) -> None:
                     if what[up, ja] == _RASTER and what[down, jb] == _RASTER:
                         w[_NEARBY + m] = gap + 0.006 * first if gap < _NEAR * first else 0.0
             if between:
-                _approach(s, ox, oy, oz, w)
-                _approach(s, ox, oy, oz, w)
+                for _ in range(3):
+                    _approach(s, ox, oy, oz, w)
             for m in range(length):
                 j = left + m * step_j
                 n = i // BLOCK * across + j // BLOCK
@@ -642,40 +664,126 @@ def _sweep(s: Surface, view: View, far: int, between: bool, turn: bool) -> None:
 @compiled
 def _shade(s: Surface, light: Light, view: View, sway: float, image: F32) -> None:
     """Fill `image` with the light of what the rays of a view met; four rays where neighbours see different things."""
-    rays, R, pixel, pace, depth, what = view.rays, view.R, view.pixel, view.pace, view.depth, view.what
+    rays, depth, what, w = view.rays, view.depth, view.what, view.chunk
     height, width, _ = rays.shape
-    across, lod = (width + BLOCK - 1) // BLOCK, 0.0
+    across = (width + BLOCK - 1) // BLOCK
     for i in range(height):
         ox, oy, oz = view.p[i, 0], view.p[i, 1], view.p[i, 2]
         late = view.row_s * (i - 0.5 * (height - 1))
-        t_s = view.t_s + late
         up, down = max(i - 1, 0), min(i + 1, height - 1)
-        for j in range(width):
-            n = i // BLOCK * across + j // BLOCK
-            kind, count, found = view.blocks[n, 0], view.blocks[n, 1], view.blocks[n, 2:]
-            t, w, left, right = depth[i, j], what[i, j], max(j - 1, 0), min(j + 1, width - 1)
-            if j % BLOCK == 0:
-                lod = math.log2(max(1.15 * t * pixel / s.texel, 1e-3))
-            if what[up, j] == w and what[down, j] == w and what[i, left] == w and what[i, right] == w:
-                dx, dy, dz = _turned(R, i, rays[i, j, 0], rays[i, j, 1])
-                r, g, b = _seen(
-                    s, light, t, w >> 4, w & 15, ox, oy, oz, dx, dy, dz, pixel, lod, found, count, late, pace, t_s, sway
-                )
-            else:
-                r, g, b = 0.0, 0.0, 0.0
-                fu, fv = -0.125 * pixel, -0.375 * pixel
-                for _ in range(4):
-                    fu, fv = -fv, fu  # a turned square: four different rows and columns
-                    dx, dy, dz = _turned(R, i, rays[i, j, 0] + fu, rays[i, j, 1] + fv)
-                    t = _on_raster(s, ox, oy, oz, dx, dy, dz, view.starts[n], kind, oz + depth[i, j] * dz)
-                    t, solid, face = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, late, pace)
-                    fine = math.log2(max(1.15 * t * pixel / s.texel, 1e-3))
-                    r1, g1, b1 = _seen(
-                        s, light, t, solid, face, ox, oy, oz, dx, dy, dz, pixel, fine, found, count, late, pace, t_s,
-                        sway,
-                    )  # fmt: skip
-                    r, g, b = r + 0.25 * r1, g + 0.25 * g1, b + 0.25 * b1
-            image[i, j, 0], image[i, j, 1], image[i, j, 2] = b, g, r
+        for begin in range(0, width, _CHUNK):
+            length = min(_CHUNK, width - begin)
+            for m in range(length):
+                t = depth[i, begin + m]
+                dx, dy, dz = _turned(view.R, i, rays[i, begin + m, 0], rays[i, begin + m, 1])
+                w[_X + m], w[_Y + m], w[_Z + m] = ox + t * dx, oy + t * dy, oz + t * dz
+            _raster_lights(s, view, i, begin, length, sway, view.t_s + late)
+            for m in range(length):
+                j = begin + m
+                n = i // BLOCK * across + j // BLOCK
+                count = view.blocks[n, 1]
+                k, left, right = what[i, j], max(j - 1, 0), min(j + 1, width - 1)
+                same = what[up, j] == k and what[down, j] == k and what[i, left] == k and what[i, right] == k
+                if same and k == _RASTER and (count == 0 or view.blocks[n, count + 1] < s.still):
+                    footprint = depth[i, j] * view.pixel
+                    gain = _UNIT
+                    if footprint < _FINEST:
+                        strength = (view.texels[_FINE + m] >> _STRENGTH) / 25600.0
+                        fine = detail_gain(s, w[_X + m], w[_Y + m], footprint, strength)
+                        gain *= fine * fine
+                    gain *= w[_SHADE + m]
+                    r, g, b = gain * w[_R + m], gain * w[_G + m], gain * w[_B + m]
+                else:
+                    r, g, b = _pixel(s, light, view, i, j, n, same, sway)
+                image[i, j, 0], image[i, j, 1], image[i, j, 2] = b, g, r
+
+
+@compiled
+def _lod(s: Surface, view: View, i: int, j: int) -> float:
+    """Level of detail of the surface's texture for the pixels of a row in one block."""
+    return math.log2(max(1.15 * view.depth[i, j // BLOCK * BLOCK] * view.pixel / s.texel, 1e-3))
+
+
+@compiled
+def _raster_lights(s: Surface, view: View, i: int, begin: int, length: int, sway: float, t_s: float) -> None:
+    """For a chunk of points X, Y, Z: light R, G, B of the raster as `raster_light` says, and the SHADE of leaves on it.
+
+    The finest detail is left out; points on plants are moved to where they stand in still air.
+    """
+    w, c = view.chunk, view.texels
+    lod = 0.0
+    for m in range(length):
+        if m % BLOCK == 0:
+            lod = _lod(s, view, i, begin + m)
+        x, y, w[_SHADE + m] = w[_X + m], w[_Y + m], 1.0
+        leafy = _leafy(s, x, y)
+        if leafy > 0:
+            w[_SHADE + m] = _leaf(s, x, y, w[_Z + m], lod)
+            if sway > 0.0:
+                w[_X + m], w[_Y + m] = _blown(x, y, sway * leafy / 255.0, t_s)
+    for coarser in range(2):
+        for first in range(0, length, BLOCK):
+            lod = _lod(s, view, i, begin + first)
+            level = min(max(int(lod), 0), MIPS - 2)
+            rest = min(max(lod - level, 0.0), 1.0)
+            level += coarser
+            start, rows, columns = s.colour_at[level]
+            scale = 1.0 / (1 << level)
+            for m in range(first, first + BLOCK):
+                w[_PER + m], w[_SHIFT + m], w[_REST + m] = s.per_texel * scale, 0.5 * scale - 0.5, rest
+                w[_BEGIN + m], w[_ROW + m] = start, columns
+                w[_EAST + m], w[_NORTH + m] = columns - 1.001, rows - 1.001
+        to = _COARSE if coarser else _FINE
+        for m in range(_CHUNK):
+            u = min(max((w[_X + m] - s.west) * w[_PER + m] + w[_SHIFT + m], 0.0), w[_EAST + m])
+            v = min(max((w[_Y + m] - s.south) * w[_PER + m] + w[_SHIFT + m], 0.0), w[_NORTH + m])
+            w[_FU + m], w[_FV + m] = (u - np.floor(u)) * 256.0, (v - np.floor(v)) * 256.0
+            w[_AT + m] = w[_BEGIN + m] + np.floor(v) * w[_ROW + m] + np.floor(u)
+        for m in range(length):
+            a, b = np.uint64(w[_AT + m]), np.uint64(w[_AT + m] + w[_ROW + m])
+            c[_C00 + m], c[_C01 + m] = s.colour[a], s.colour[a + _ONE]
+            c[_C10 + m], c[_C11 + m] = s.colour[b], s.colour[b + _ONE]
+        for m in range(_CHUNK):
+            fu, fv = np.uint64(w[_FU + m]), np.uint64(w[_FV + m])
+            w11 = (fu * fv) >> np.uint64(8)
+            c[to + m] = (
+                (np.uint64(256) - fu - fv + w11) * _spread(c[_C00 + m])
+                + (fu - w11) * _spread(c[_C01 + m])
+                + (fv - w11) * _spread(c[_C10 + m])
+                + w11 * _spread(c[_C11 + m])
+            )
+    for m in range(_CHUNK):
+        near, far, rest = c[_FINE + m], c[_COARSE + m], w[_REST + m]
+        r = ((1.0 - rest) * (near & _LOW) + rest * (far & _LOW)) / 256.0
+        g = ((1.0 - rest) * (near >> _GREEN & _LOW) + rest * (far >> _GREEN & _LOW)) / 256.0
+        b = ((1.0 - rest) * (near >> _BLUE & _LOW) + rest * (far >> _BLUE & _LOW)) / 256.0
+        w[_R + m], w[_G + m], w[_B + m] = r * r, g * g, b * b
+
+
+@compiled
+def _pixel(
+    s: Surface, light: Light, view: View, i: int, j: int, n: int, same: bool, sway: float
+) -> tuple[float, float, float]:
+    """Light RGB of a pixel of block n: of its ray, or where its neighbours do not see the `same`, of four."""
+    kind, count, found, pixel = view.blocks[n, 0], view.blocks[n, 1], view.blocks[n, 2:], view.pixel
+    ox, oy, oz = view.p[i, 0], view.p[i, 1], view.p[i, 2]
+    late = view.row_s * (i - 0.5 * (view.rays.shape[0] - 1))
+    t_s, lod, t = view.t_s + late, _lod(s, view, i, j), view.depth[i, j]
+    solid, face = view.what[i, j] >> 4, view.what[i, j] & 15
+    rays, r, g, b = (1 if same else 4), 0.0, 0.0, 0.0
+    fu, fv = (0.0, 0.0) if same else (-0.125 * pixel, -0.375 * pixel)
+    for _ in range(rays):
+        fu, fv = -fv, fu  # a turned square: four different rows and columns
+        dx, dy, dz = _turned(view.R, i, view.rays[i, j, 0] + fu, view.rays[i, j, 1] + fv)
+        if not same:
+            t = _on_raster(s, ox, oy, oz, dx, dy, dz, view.starts[n], kind, oz + view.depth[i, j] * dz)
+            t, solid, face = _before(s, t, ox, oy, oz, dx, dy, dz, found, count, late, view.pace)
+            lod = math.log2(max(1.15 * t * pixel / s.texel, 1e-3))
+        r1, g1, b1 = _seen(
+            s, light, t, solid, face, ox, oy, oz, dx, dy, dz, pixel, lod, found, count, late, view.pace, t_s, sway
+        )
+        r, g, b = r + r1 / rays, g + g1 / rays, b + b1 / rays
+    return r, g, b
 
 
 @compiled
