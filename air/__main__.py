@@ -119,7 +119,10 @@ def _add_calibrate(parser: argparse.ArgumentParser) -> None:
     imu.add_argument("source", metavar="SOURCE", help="with camera frames and IMU samples, e.g. euroc:DIR or F.mcap")
     imu.add_argument("--calibration", type=Path, required=True, metavar="F", help="intrinsics: our TOML, Kalibr, EuRoC")
     imu.set_defaults(run=_calibrate_imu_camera)
-    for kind in (camera, imu):
+    flight = kinds.add_parser("flight", help="all of that from an ordinary flight that turns: no board, no known lens")
+    flight.add_argument("source", metavar="SOURCE", help="with camera frames and IMU samples, e.g. gopro:F or F.mcap")
+    flight.set_defaults(run=_calibrate_flight)
+    for kind in (camera, imu, flight):
         kind.add_argument("--out", type=Path, metavar="F.toml", help="write the calibration here")
         kind.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -282,6 +285,13 @@ def _calibrate_imu_camera(args: argparse.Namespace) -> int:
     from air.calibration.command import calibrate_from_recording
 
     print(calibrate_from_recording(args.source, args.calibration, args.out, args.quiet))
+    return 0
+
+
+def _calibrate_flight(args: argparse.Namespace) -> int:
+    from air.calibration.recorded_flight import calibrate_from_flight
+
+    print(calibrate_from_flight(args.source, args.out, args.quiet))
     return 0
 
 

@@ -16,11 +16,11 @@ from air.calibration.imu_camera import ImuCamera, calibrate_imu_camera
 from air.calibration.rotations import Turn, TurnTracker
 from air.sensors.calibration import Calibration, read_calibration, to_toml
 from air.sources.source import open_source
-from common.arrays import U8
+from common.arrays import F64, U8
 from common.camera import CameraModel
 from common.errors import CalibrationError, ConfigError
 from common.measurements import CameraFrame, Encoding, ImuSample
-from common.se3 import SE3, matrix_to_quaternion
+from common.se3 import SE3
 
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 
@@ -33,7 +33,7 @@ def calibrate_from_images(folder: Path, board: str, square: float, out: Path | N
     shape = _board(board, square)
     views, size, unseen = _views(folder, shape, quiet)
     found = calibrate_camera(views, size, shape)
-    _write(out, to_toml(Calibration(found.camera), found.sigma))
+    write_calibration(out, to_toml(Calibration(found.camera), found.sigma))
     return "\n".join(_camera_report(found, unseen, out))
 
 
@@ -48,8 +48,8 @@ def calibrate_from_recording(url: str, calibration: Path, out: Path | None, quie
     t = np.zeros(3) if known.T_body_cam is None else known.T_body_cam.t
     result = replace(known, T_body_cam=SE3(found.R_body_cam, t), time_offset_s=found.time_offset_s)
     sigma = {"time_offset_s": found.sigma_offset_s, "rotation_rad": float(found.sigma_rotation.max())}
-    _write(out, to_toml(result, sigma))
-    return "\n".join(_imu_report(found, out))
+    write_calibration(out, to_toml(result, sigma))
+    return "\n".join(_imu_report(found, result, out))
 
 
 def _board(text: str, square: float) -> Board:
@@ -101,7 +101,7 @@ def _turns(url: str, camera: CameraModel, quiet: bool) -> tuple[list[int], list[
             stamps.append(item.t_ns)
             rates.append(item.gyro.tolist())
         elif isinstance(item, CameraFrame) and item.camera == (name := name or item.camera):
-            grey = _grey_frame(item)
+            grey = decoded_grey(item)
             if grey is not None and grey.shape != (camera.height, camera.width):
                 size = f"{grey.shape[1]}×{grey.shape[0]}"
                 raise CalibrationError(
@@ -112,7 +112,8 @@ def _turns(url: str, camera: CameraModel, quiet: bool) -> tuple[list[int], list[
     return stamps, rates, turns
 
 
-def _grey_frame(frame: CameraFrame) -> U8 | None:
+def decoded_grey(frame: CameraFrame) -> U8 | None:
+    """Grey levels (H, W) of a frame; None for one that is damaged or H.264."""
     if frame.encoding in (Encoding.JPEG, Encoding.PNG):
         return _grey(frame.data)
     depth = {Encoding.MONO8: 1, Encoding.BGR8: 3}.get(frame.encoding)
@@ -131,7 +132,8 @@ def _grey(data: bytes) -> U8 | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-def _write(out: Path | None, text: str) -> None:
+def write_calibration(out: Path | None, text: str) -> None:
+    """Write a calibration, if there is where to. Raises CalibrationError."""
     if out is None:
         return
     try:
@@ -153,16 +155,23 @@ def _camera_report(found: Intrinsics, unseen: dict[str, str], out: Path | None) 
     return lines + [f"warning: {warning}" for warning in found.warnings] + _written(out)
 
 
-def _imu_report(found: ImuCamera, out: Path | None) -> list[str]:
-    wxyz = ", ".join(f"{q:.6f}" for q in matrix_to_quaternion(found.R_body_cam))
-    x, y, z = np.degrees(found.sigma_rotation)
-    bias = ", ".join(f"{b:.5f}" for b in found.bias)
+def _imu_report(found: ImuCamera, known: Calibration, out: Path | None) -> list[str]:
     return [
-        f"R_body_cam, wxyz = {wxyz} ± {x:.2f}°, {y:.2f}°, {z:.2f}° about the axes of the body",
-        f"time of the IMU = time of the camera {1e3 * found.time_offset_s:+.2f} ± {1e3 * found.sigma_offset_s:.2f} ms",
-        f"bias of the gyroscope = {bias} rad/s",
+        *imu_lines(known, found.sigma_rotation, found.sigma_offset_s, found.bias),
         f"{found.turns} turns, of which {np.degrees(found.residual):.3f}° rms are not explained",
         *_written(out),
+    ]
+
+
+def imu_lines(known: Calibration, sigma_rotation: F64, sigma_offset_s: float, bias: F64) -> list[str]:
+    """Lines on how a camera sits on its IMU; sigma (3,) rad about the axes of the body, bias (3,) rad/s."""
+    assert known.T_body_cam is not None
+    wxyz = ", ".join(f"{q:.6f}" for q in known.T_body_cam.wxyz)
+    x, y, z = np.degrees(sigma_rotation)
+    return [
+        f"R_body_cam, wxyz = {wxyz} ± {x:.2f}°, {y:.2f}°, {z:.2f}° about the axes of the body",
+        f"time of the IMU = time of the camera {1e3 * known.time_offset_s:+.2f} ± {1e3 * sigma_offset_s:.2f} ms",
+        f"bias of the gyroscope = {', '.join(f'{b:.5f}' for b in bias)} rad/s",
     ]
 
 

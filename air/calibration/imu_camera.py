@@ -75,6 +75,20 @@ def calibrate_imu_camera(t_ns: Sequence[int], gyro: F64, turns: Sequence[Turn]) 
     return ImuCamera(best.R, sigma[:3], best.offset_s, float(sigma[3]), best.bias, residual, len(seen))
 
 
+def guess_imu_camera(t_ns: Sequence[int], gyro: F64, turns: Sequence[Turn]) -> tuple[F64, float, float]:
+    """`R_body_cam` (3, 3), the time offset s and the rms rad of what they leave of the turns, however uncertain.
+
+    Raises CalibrationError when too few turns lie within the IMU's recording.
+    """
+    imu = _Gyro(np.asarray(t_ns, np.int64), np.asarray(gyro, float))
+    seen = [turn for turn in turns if imu.covers(turn)]
+    if len(seen) < MIN_TURNS // 2:
+        raise CalibrationError(f"only {len(seen)} turns lie within the IMU's recording; are both on one clock?")
+    offset_s = _correlate(imu, seen)
+    state = _fit(imu, seen, _State(_kabsch(imu, seen, offset_s), offset_s, np.zeros(3)))
+    return state.R, state.offset_s, float(np.sqrt(np.mean(_residuals(imu, seen, state) ** 2) * 3))
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     R: F64

@@ -76,6 +76,21 @@ def turn_between(before: F64, after: F64, inlier: float) -> F64 | None:
     return rotation_vector(_refined(R, -R @ travel.ravel(), before[used], after[used]))
 
 
+def turn_alone(before: F64, after: F64) -> F64:
+    """Rotation vector (3,) rad that maps rays `after` (N, 3) into the frame of `before`, small, of a far scene.
+
+    Least squares with Cauchy's weights, which forget what is near and moves otherwise.
+    """
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (before, after))
+    J, weight, turn = -np.array([skew(ray) for ray in b]), np.ones(len(a)), np.zeros(3)
+    for _ in range(ROUNDS):
+        H = np.einsum("nji,n,njk->ik", J, weight, J)
+        turn = np.linalg.solve(H, np.einsum("nji,n,nj->i", J, weight, a - b))
+        off = np.linalg.norm(a - b - J @ turn, axis=1)
+        weight = 1.0 / (1.0 + (off / (np.median(off) + 1e-9)) ** 2)
+    return np.asarray(turn)
+
+
 def _refined(R: F64, travel: F64, before: F64, after: F64) -> F64:
     """The rotation after Gauss–Newton with Cauchy's weights, which forget tracks that are far off."""
     for _ in range(ROUNDS):

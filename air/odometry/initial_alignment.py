@@ -115,9 +115,9 @@ def _reduced(seen: InitialPoints, moves: F64, weight: F64) -> tuple[F64, F64]:
     A, b = np.zeros((len(seen.angle), 3, 3)), np.zeros((len(seen.angle), 3, UNKNOWNS))
     np.add.at(A, seen.point, weight)
     np.add.at(b, seen.point, weight @ moves)
-    points: F64 = np.linalg.solve(A + 1e-12 * np.eye(3), b)
-    H: F64 = np.einsum("nki,nkl,nlj->ij", moves, weight, moves) - np.einsum("nki,nkj->ij", b, points)
-    return H, points
+    points = np.asarray(np.linalg.solve(A + 1e-12 * np.eye(3), b), np.float64)
+    H = np.einsum("nki,nkl,nlj->ij", moves, weight, moves) - np.einsum("nki,nkj->ij", b, points)
+    return np.asarray(H, np.float64), points
 
 
 def _known(x: F64, motion: InertialMotion, fall: F64, axes: F64, imu: ImuSettings, speeds: Sequence[SpeedAt]) -> F64:
