@@ -52,9 +52,9 @@ class Adjustment:
 
     def fit(self, flight: Flight, free: I64, iterations: int) -> Fit:
         """The flight with some of the unknowns `free`, after so many steps at most."""
-        cost, damping, information = self.cost(flight), DAMPING, np.eye(COUNT)
+        cost, damping = self.cost(flight), DAMPING
+        system = self._linear(flight, free)
         for _ in range(iterations):
-            system = self._linear(flight, free)
             before = cost
             for _ in range(TRIALS):
                 new = system.step(flight, damping)
@@ -64,10 +64,10 @@ class Adjustment:
                     damping = max(damping / 10, LEAST_DAMPING)
                     break
                 damping *= 10
-            information = system.information()
             if before - cost < ENOUGH * cost:
                 break
-        return Fit(flight, cost, information)
+            system = self._linear(flight, free)
+        return Fit(flight, cost, system.information())
 
     def _linear(self, flight: Flight, free: I64) -> _System:
         """The problem linearised at a flight."""

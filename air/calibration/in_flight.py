@@ -32,7 +32,7 @@ from air.calibration.imu_camera import guess_imu_camera
 from air.calibration.rotations import Turn, turn_alone
 from air.odometry.tracker import TrackedFrame
 from air.sensors.calibration import Calibration
-from common.arrays import F64
+from common.arrays import F64, I64
 from common.camera import CameraModel
 from common.errors import CalibrationError
 from common.se3 import SE3
@@ -44,7 +44,7 @@ PIXEL_SIGMA, INDEPENDENT = 1.0, 4.0
 """Errors of one track are alike: it counts as so many observations, each of so many px."""
 ROUNDS, REJECT, ROBUST = 2, 2.5, 3.0
 FIRST_STEPS, STEPS = 12, 15
-MAX_FOCAL_SIGMA = 0.05
+MAX_FOCAL_SIGMA, MIN_TURNING = 0.05, np.radians(0.2)
 _EVERYTHING = np.arange(COUNT)
 _FIRST = np.array([FOCAL, *range(5, 9), *range(10, 13)])
 
@@ -73,6 +73,12 @@ def calibrate_in_flight(
         raise CalibrationError(
             f"{len(frames)} frames and {len(t_ns)} IMU samples at the same time; {MIN_FRAMES} frames at least"
         )
+    turned = turning(t_ns, rates)
+    if not turned > MIN_TURNING:
+        raise CalibrationError(
+            f"the body turned by {np.degrees(turned):.2f}° rms only; turn the camera, "
+            f"by {np.degrees(MIN_TURNING):.1f}° rms at least, while it sees a near and textured scene"
+        )
     guess, R_body_cam, offset_s = _first_guess(frames, size, t_ns, rates)
     gyro = Gyroscope(t_ns, rates)
     model = FlightModel(_sightings(frames, gyro, offset_s), gyro, guess, R_body_cam)
@@ -94,6 +100,15 @@ def calibrate_in_flight(
     named |= {"rotation_rad": float(sigma[MOUNTING].max())}
     found = Calibration(camera, mounting, float(theta[OFFSET]), max(float(theta[LINE]), 0.0))
     return FlightCalibration(found, named, theta[BIAS], kept_px, model.seen.points, len(model.seen.t_s))
+
+
+def turning(t_ns: Sequence[int] | I64, rates: F64) -> float:
+    """How far attitudes spread about a steady turn, rad rms, by the rates (N, 3) rad/s."""
+    t_s = (np.asarray(t_ns, np.int64) - t_ns[0]) * 1e-9
+    angle = np.cumsum(rates * np.gradient(t_s)[:, None], axis=0)
+    trend = np.column_stack([np.ones(len(t_s)), t_s])
+    rest = angle - trend @ np.linalg.lstsq(trend, angle, rcond=None)[0]
+    return float(np.sqrt(np.sum(rest.var(axis=0))))
 
 
 def _first_guess(

@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from air.calibration.command import decoded_grey, imu_lines, write_calibration
-from air.calibration.in_flight import FlightCalibration, calibrate_in_flight
+from air.calibration.in_flight import FlightCalibration, calibrate_in_flight, turning
 from air.odometry.settings import TrackerSettings
 from air.odometry.tracker import TrackedFrame, Tracker
 from air.sensors.calibration import to_toml
@@ -44,16 +44,11 @@ def busiest(t_ns: I64, rates: F64) -> tuple[int, int]:
     By how far attitudes spread about their trend: vibration does not count.
     """
     t_s = (t_ns - t_ns[0]) * 1e-9
-    angle = np.cumsum(rates * np.gradient(t_s)[:, None], axis=0)
     begins_s = np.arange(0.0, max(t_s[-1] - LONGEST_S, 0.0) + STEP_S, STEP_S)
 
     def spread(begin_s: float) -> float:
         part = slice(*np.searchsorted(t_s, [begin_s, begin_s + LONGEST_S]))
-        if t_s[part].size < 3:
-            return 0.0
-        trend = np.column_stack([np.ones(t_s[part].size), t_s[part]])
-        rest = angle[part] - trend @ np.linalg.lstsq(trend, angle[part], rcond=None)[0]
-        return float(np.sum(rest.var(axis=0)))
+        return turning(t_ns[part], rates[part]) if t_s[part].size > 2 else 0.0
 
     begin_s = float(max(begins_s, key=spread))
     return int(t_ns[0] + round(begin_s * 1e9)), int(min(t_ns[0] + round((begin_s + LONGEST_S) * 1e9), t_ns[-1]))

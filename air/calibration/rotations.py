@@ -82,7 +82,8 @@ def turn_alone(before: F64, after: F64) -> F64:
     Least squares with Cauchy's weights, which forget what is near and moves otherwise.
     """
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (before, after))
-    J, weight, turn = -np.array([skew(ray) for ray in b]), np.ones(len(a)), np.zeros(3)
+    J = np.cross(np.eye(3), b[:, None, :]).transpose(0, 2, 1)  # how each ray moves with the turn
+    weight, turn = np.ones(len(a)), np.zeros(3)
     for _ in range(ROUNDS):
         H = np.einsum("nji,n,njk->ik", J, weight, J)
         turn = np.linalg.solve(H, np.einsum("nji,n,nj->i", J, weight, a - b))
