@@ -19,7 +19,7 @@ from air.sources.source import Source, open_source
 from common.errors import CalibrationError, ExportError
 from common.export.trajectory import write_tum
 from common.measurements import CameraFrame
-from common.messages import EstimatorState, Keyframe, Pose
+from common.messages import Datum, EstimatorState, Keyframe, Pose
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class _Told:
     poses: list[Pose] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     states: list[EstimatorState] = field(default_factory=list)
+    datum: Datum | None = None
 
     def add(self, outputs: list[Output]) -> None:
         for message in outputs:
@@ -61,6 +62,8 @@ class _Told:
                 self.poses.append(message)
             elif isinstance(message, Keyframe):
                 self.keyframes.append(message)
+            elif isinstance(message, Datum):
+                self.datum = message
             else:
                 self.states.append(message)
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from heapq import merge
 
 import numpy as np
 from gnss_scene import BASE_WORLD, broadcast
+from odometry_scene import HOME, Scene
 
 from air.gnss.gnss_time import SECOND_NS
-from air.odometry.gnss_inertial import GnssInertialPose
+from air.odometry.estimator import Estimate, Estimator
+from air.odometry.tracker import TrackedFrame
 from air.sources.simulated.clocks import ClockOptions, Device, DeviceClock
 from air.sources.simulated.extrinsics import ExtrinsicsOptions, draw_extrinsics
 from air.sources.simulated.gnss.antenna import carried_antenna, fixed_antenna
@@ -29,7 +31,6 @@ from common.measurements import GnssEpoch, ImuSample
 from common.messages import Datum
 
 DATUM = Datum("gnss-flight", 30.5355, 114.3655, 62.0)
-HOME = np.array([0.0, 0.0, 0.2])
 BASE_ECEF = T_ecef_enu(DATUM).apply(BASE_WORLD)
 
 
@@ -87,11 +88,38 @@ def _samples(imu: SimulatedImu, delay_s: float) -> Iterator[tuple[int, ImuSample
             yield t_ns, ImuSample(t_ns, batch.accel[i], batch.gyro[i])
 
 
-def errors(flown: GnssFlight, poses: list[GnssInertialPose]) -> tuple[F64, F64]:
-    """Position errors (N, 3) m, east, north, up, and their normalised squares (N,)."""
+def with_frames(flown: GnssFlight, scene: Scene) -> list[object]:
+    """The measurements of a flight, and what a tracker saw on the same one, in order of time."""
+    frames = [(m.t_ns, m) for m in scene.sensed() if isinstance(m, TrackedFrame)]
+    heard = [m for m in flown.messages if isinstance(m, ImuSample | GnssEpoch)]
+    told = [m for m in flown.messages if not isinstance(m, ImuSample | GnssEpoch)]
+    return [*told, *(m for _, m in merge(((m.t_ns, m) for m in heard), frames, key=lambda pair: pair[0]))]
+
+
+def estimates(estimator: Estimator, messages: Iterable[object]) -> list[Estimate]:
+    """What an estimator says of a flight."""
+    out, waiting = [], list[TrackedFrame]()
+    for message in messages:
+        if isinstance(message, ImuSample):
+            estimator.add_imu(message)
+            while waiting and waiting[0].t_ns <= message.t_ns:
+                outcome = estimator.add_frame(waiting.pop(0))
+                out += [outcome] if isinstance(outcome, Estimate) else []
+            out += estimator.take_epochs()
+        elif isinstance(message, TrackedFrame):
+            waiting.append(message)
+        elif isinstance(message, GnssEpoch):
+            (estimator.gnss.add_base if message.receiver == "base" else estimator.gnss.add_epoch)(message)
+        else:
+            estimator.gnss.add(message)
+    return out
+
+
+def errors(flown: GnssFlight, poses: list[Estimate], datum: Datum) -> tuple[F64, F64]:
+    """Errors (N, 3) m, east, north, up, of poses in the world of a datum, and their normalised squares (N,)."""
     off, squares = [], []
     for pose in poses:
-        T = T_world_other(DATUM, pose.datum) @ pose.state.T_world_body
+        T = T_world_other(DATUM, datum) @ pose.state.T_world_body
         error = T.t - flown.truth(pose.state.t_ns)[0]
         off.append(error)
         in_body = T.R.T @ error

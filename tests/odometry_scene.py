@@ -14,6 +14,7 @@ from air.sources.simulated.extrinsics import R_BODY_NADIR
 from air.sources.simulated.imu import ImuOptions, SimulatedImu
 from air.sources.simulated.motion.mission import FlightOptions
 from air.sources.simulated.motion.multirotor import fly
+from air.sources.simulated.survey import START_NS
 from common.arrays import F64
 from common.camera import CameraModel
 from common.measurements import ImuSample
@@ -23,7 +24,7 @@ from common.se3 import SE3
 DATUM = Datum("2024-06-01T09-00-00-test", 30.5355, 114.3655, 62.0)
 CAMERA = CameraModel(1280, 720, 900.0, 900.0, 639.5, 359.5)
 T_BODY_CAM = SE3(R_BODY_NADIR, np.array([0.10, 0.0, -0.08]))
-START_NS = 1_400_000_000_000_000_000
+HOME = np.array([0.0, 0.0, 0.2])
 FEATURES = 160
 
 
@@ -43,7 +44,7 @@ class Scene:
     line_time_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self.trajectory = fly(self.options, self.seed, self.duration_s, np.array([0.0, 0.0, 0.3]))[0]
+        self.trajectory = fly(self.options, self.seed, self.duration_s, HOME)[0]
         clock = DeviceClock.draw(ClockOptions.perfect(), self.seed, Device.IMU, self.duration_s)
         self.device = SimulatedImu(self.trajectory, DATUM, self.imu, self.seed, clock)
         rng = np.random.default_rng([self.seed, 7])

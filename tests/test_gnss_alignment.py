@@ -13,6 +13,8 @@ from air.odometry.gnss_alignment import Anchor, YawAlignment, align_yaw, find_an
 from common.arrays import F64
 from common.geo import T_ecef_enu
 
+MOST = np.radians(2.0)
+
 
 def turned(v: F64, yaw: float) -> F64:
     c, s = np.cos(yaw), np.sin(yaw)
@@ -24,7 +26,7 @@ def test_yaw_comes_back_within_its_sigma(yaw: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     local = rng.normal(0, 1, 3) + rng.normal(0, 0.5, (30, 3))
     sigma = np.full(30, 0.05)
-    found = align_yaw(local, turned(local, yaw) + 0.05 * rng.standard_normal((30, 3)), sigma)
+    found = align_yaw(local, turned(local, yaw) + 0.05 * rng.standard_normal((30, 3)), sigma, MOST)
     assert isinstance(found, YawAlignment)
     error = (found.yaw - yaw + np.pi) % (2 * np.pi) - np.pi
     assert abs(error) < 5 * found.sigma  # five sigmas: once in two million
@@ -33,18 +35,18 @@ def test_yaw_comes_back_within_its_sigma(yaw: float, seed: int) -> None:
 def test_yaw_is_refused_when_it_cannot_be_known() -> None:
     rng = np.random.default_rng(0)
     still = 0.01 * rng.standard_normal((20, 3))
-    assert "moving" in str(align_yaw(still, 0.1 * rng.standard_normal((20, 3)), np.full(20, 0.1)))
+    assert "moving" in str(align_yaw(still, 0.1 * rng.standard_normal((20, 3)), np.full(20, 0.1), MOST))
     flying = rng.normal(0, 3, (20, 3))
-    assert "contradict" in str(align_yaw(flying, turned(flying, 1.0) * 1.5, np.full(20, 0.05)))
-    assert "too few" in str(align_yaw(flying[:2], flying[:2], np.full(2, 0.05)))
-    assert "stands" in str(align_yaw(np.zeros((20, 3)), np.zeros((20, 3)), np.full(20, 0.05)))
+    assert "contradict" in str(align_yaw(flying, turned(flying, 1.0) * 1.5, np.full(20, 0.05), MOST))
+    assert "too few" in str(align_yaw(flying[:2], flying[:2], np.full(2, 0.05), MOST))
+    assert "stands" in str(align_yaw(np.zeros((20, 3)), np.zeros((20, 3)), np.full(20, 0.05), MOST))
 
 
 def test_four_velocities_of_one_second_each_suffice() -> None:
     """At 1 Hz, 3 m/s and 5 cm/s of noise the yaw is good to a degree after four epochs."""
     rng = np.random.default_rng(1)
     local = np.array([[3.0, 0.1, 0.0]] * 4)
-    found = align_yaw(local, turned(local, 2.0) + 0.05 * rng.standard_normal((4, 3)), np.full(4, 0.05))
+    found = align_yaw(local, turned(local, 2.0) + 0.05 * rng.standard_normal((4, 3)), np.full(4, 0.05), MOST)
     assert isinstance(found, YawAlignment)
     assert abs(found.yaw - 2.0) < np.radians(2.0)
 

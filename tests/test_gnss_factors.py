@@ -11,11 +11,11 @@ from gnss_scene import DATUM
 
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
-from air.odometry.gnss_biases import BiasNode, Kind, first_node, needed, next_node, start_values
-from air.odometry.gnss_factors import STATES, AntennaMotion, antenna_motion, as_factor, linearise
+from air.odometry.gnss_biases import BiasNode, Kind, first_node, needed, next_node
+from air.odometry.gnss_factors import STATES, AntennaMotion, antenna_motion, linearise
 from air.odometry.gnss_preprocessing import CleanEpoch
-from air.odometry.gnss_prior import Prior
 from air.odometry.gnss_settings import GnssNoise
+from air.odometry.quadratic import Quadratic
 from common.arrays import F64
 from common.geo import T_ecef_enu
 
@@ -148,7 +148,7 @@ def test_satellites_without_a_place_in_the_node_are_left_out() -> None:
     epoch = epoch_at(motion.p_world, motion.v_world, 0.0, 0.0, biases)
     node, _ = first_node(0, epoch.t_ns, needed([replace(epoch, code=epoch.code.copy())], NOISE))
     stranger = replace(epoch, satellites=("G32", *epoch.satellites[1:]), arcs=("", *epoch.arcs[1:]))
-    u = start_values(node)
+    u = np.zeros(len(node))
     assert linearise(stranger, motion, node, u, T_ECEF_WORLD, np.inf).rows == 7 + 3 + 4
 
 
@@ -161,29 +161,33 @@ def test_one_wild_code_hardly_counts() -> None:
     assert pulls[1] < 0.1 * pulls[0]
 
 
-def values_of(node: BiasNode, u: F64, pose: gtsam.Pose3 = POSE) -> tuple[gtsam.Values, tuple[int, ...]]:
-    keys = gtsam.symbol("x", 0), gtsam.symbol("v", 0), gtsam.symbol("b", 0), node.key
-    values = gtsam.Values()
-    values.insert(keys[0], pose)
-    values.insert(keys[1], VELOCITY)
-    values.insert(keys[2], IMU_BIAS)
-    values.insert(keys[3], u)
-    return values, keys
-
-
-def test_gtsam_sees_the_same_numbers() -> None:
-    motion, biases = moved(np.zeros(STATES)), np.linspace(-1, 1, 8)
-    epoch = epoch_at(motion.p_world + 0.3, motion.v_world, 5.0, 1.0, biases)
-    node, u = node_for(epoch, np.zeros(8))
+def known_at(values: gtsam.Values, node: BiasNode, epoch: CleanEpoch, motion: AntennaMotion, u: F64) -> Quadratic:
     linear = linearise(epoch, motion, node, u, T_ECEF_WORLD, np.inf)
-    values, keys = values_of(node, u)
-    factor = as_factor(linear, keys, values)
-    graph = gtsam.GaussianFactorGraph()
-    graph.push_back(factor.linearize(values))
-    G, g = graph.hessian(gtsam.Ordering(list(keys)))
-    assert np.allclose(G, linear.G, rtol=1e-12, atol=1e-6)
-    assert np.allclose(np.ravel(g), linear.g, rtol=1e-12, atol=1e-6)
-    assert factor.error(values) == pytest.approx(linear.f / 2)
+    X, V, B = (gtsam.symbol(letter, 0) for letter in "xvb")
+    return Quadratic({X: POSE, V: VELOCITY, B: IMU_BIAS.vector(), node.key: u}, linear.G, linear.g, linear.f)
+
+
+def values_of(node: BiasNode, u: F64, pose: gtsam.Pose3 = POSE) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(gtsam.symbol("x", 0), pose)
+    values.insert(gtsam.symbol("v", 0), VELOCITY)
+    values.insert(gtsam.symbol("b", 0), IMU_BIAS)
+    values.insert(node.key, u)
+    return values
+
+
+def test_seen_from_elsewhere_it_says_the_same() -> None:
+    motion = moved(np.zeros(STATES))
+    epoch = epoch_at(motion.p_world + 0.3, motion.v_world, 5.0, 1.0, np.linspace(-1, 1, 8))
+    node, u = node_for(epoch, np.zeros(8))
+    known = known_at(values_of(node, u), node, epoch, motion, u)
+    shift = np.array([0.2, -0.1, 0.3])
+    later = values_of(node, u + 0.5, gtsam.Pose3(POSE.rotation(), POSE.translation() + POSE.rotation().rotate(shift)))
+    delta = np.concatenate([[0, 0, 0], shift, np.zeros(9), np.full(len(node), 0.5)])
+    expected = (known.f - 2 * known.g @ delta + delta @ known.G @ delta) / 2
+    assert known.error(later) == pytest.approx(expected, rel=1e-6)
+    assert known.at(later).f / 2 == pytest.approx(expected, rel=1e-6)
+    assert known.at(later).g == pytest.approx(known.g - known.G @ delta, rel=1e-6, abs=1e-3)
 
 
 def test_a_prior_knows_no_place_that_its_factors_did_not_know() -> None:
@@ -192,14 +196,10 @@ def test_a_prior_knows_no_place_that_its_factors_did_not_know() -> None:
     epoch = epoch_at(motion.p_world, motion.v_world, 0.0, 0.0, biases)
     epoch = replace(epoch.without_code(), rate=np.full(8, np.nan))
     node, _ = first_node(0, epoch.t_ns, needed([epoch], NOISE))
-    u = start_values(node)
-    values, keys = values_of(node, u)
-    prior = Prior.at(linearise(epoch, motion, node, u, T_ECEF_WORLD, np.inf), keys, values)
+    u = np.zeros(len(node))
+    known = known_at(values_of(node, u), node, epoch, motion, u)
     turned = gtsam.Pose3(POSE.rotation().compose(gtsam.Rot3.Ypr(0.05, 0.01, 0.0)), POSE.translation())
-    later, _ = values_of(node, u, turned)
-    graph = gtsam.GaussianFactorGraph()
-    graph.push_back(prior.factor(later).linearize(later))
-    G, _ = graph.hessian(gtsam.Ordering(list(keys)))
+    G = known.at(values_of(node, u, turned)).G
     shift = np.array([1.0, -2.0, 0.5])
     line = geometric_range(epoch.p_satellite, T_ECEF_WORLD.apply(motion.p_world))[1] @ T_ECEF_WORLD.R
     delta = np.zeros(STATES + len(node))
@@ -213,27 +213,33 @@ def test_a_prior_knows_no_place_that_its_factors_did_not_know() -> None:
 def test_biases_wander_from_node_to_node_as_their_processes_say() -> None:
     epoch = epoch_at(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros(8))
     wanted = needed([epoch], NOISE)
-    first, _ = first_node(0, epoch.t_ns, wanted)
-    u = start_values(first)
+    first, known = first_node(0, epoch.t_ns, wanted)
+    u = known.point[first.key].copy()
     satellite, arc = epoch.satellites[0], epoch.arcs[0]
     u[first.biases[Kind.MULTIPATH, satellite]] = 2.0
     u[first.biases[Kind.DRIFT, arc]] = 0.5
     u[first.biases[Kind.AMBIGUITY, arc]] = 100.0
     seconds = 6.0
-    later, expected, factor = next_node(first, u, epoch.t_ns + round(seconds * SECOND_NS), wanted)
+    later, link = next_node(first, u, epoch.t_ns + round(seconds * SECOND_NS), wanted)
+    expected = link.point[later.key]
     keep = np.exp(-seconds / NOISE.multipath_s)
     assert expected[later.biases[Kind.MULTIPATH, satellite]] == pytest.approx(2.0 * keep)
     assert expected[later.biases[Kind.AMBIGUITY, arc]] == pytest.approx(100.0 + 0.5 * seconds)
-    row = later.biases[Kind.MULTIPATH, satellite]
-    A = factor.jacobian()[0]  # whitened: rows in units of sigma
-    sigma = 1 / A[row, len(first) + row]
-    assert sigma == pytest.approx(3.0 * np.sqrt(1 - keep**2))
+    row = len(first) + later.biases[Kind.MULTIPATH, satellite]
+    assert link.G[row, row] ** -0.5 == pytest.approx(3.0 * np.sqrt(1 - keep**2))
+    # The same bias before and after, both moved as the process says, costs nothing.
+    delta = np.concatenate([np.full(len(first), 0.1), np.zeros(len(later))])
+    delta[len(first) :] = -np.linalg.solve(link.G[len(first) :, len(first) :], link.G[len(first) :] @ delta)
+    assert delta @ link.G @ delta == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_satellite_that_was_away_for_long_begins_anew() -> None:
     epoch = epoch_at(np.zeros(3), np.zeros(3), 0.0, 0.0, np.zeros(8))
     first, _ = first_node(0, epoch.t_ns, needed([epoch], NOISE))
-    later, _, _ = next_node(first, start_values(first), epoch.t_ns + 31 * SECOND_NS, {})
+    u = np.zeros(len(first))
+    later, _ = next_node(first, u, epoch.t_ns + 61 * SECOND_NS, {})
     assert len(later) == 0
-    soon, _, _ = next_node(first, start_values(first), epoch.t_ns + 5 * SECOND_NS, {})
+    soon, _ = next_node(first, u, epoch.t_ns + 2 * SECOND_NS, {})
     assert soon.biases == first.biases
+    without_carriers, _ = next_node(first, u, epoch.t_ns + 5 * SECOND_NS, {})
+    assert without_carriers.biases.keys() == {bias for bias in first.biases if "/" not in bias[1]}

@@ -168,7 +168,7 @@ def test_an_estimate_gone_astray_starts_its_window_anew_and_keeps_its_place() ->
 
 
 def test_the_imu_alone_is_believed_for_a_while_only() -> None:
-    scene = Scene(1, 8.0, AIR, ImuOptions())
+    scene = Scene(1, 11.0, AIR, ImuOptions())
     flight = Flight(scene, lambda t_s, m: None if isinstance(m, TrackedFrame) and t_s > 5.0 else m)
     assert flight.estimates
     assert flight.estimator.window is None

@@ -40,6 +40,10 @@ class Monitor:
         self._visual = Hysteresis(True, s.lost_s, s.back_s)
         self._gnss = Hysteresis(False, s.lost_s, s.back_s)
 
+    def found_gnss(self) -> None:
+        """GNSS counts from now on: it has just been found to agree."""
+        self._gnss.value = True
+
     def update(self, t_ns: int, points: int, satellites: int = 0) -> Mode:
         """The mode after a frame in which so many points with a known place, and satellites, were used."""
         s = self._settings

@@ -1,4 +1,4 @@
-"""The visual–inertial estimator: IMU samples and tracked frames in, states out.
+"""The estimator: IMU samples, tracked frames and GNSS epochs in, states out.
 
 It begins, adjusts its window at each frame, watches itself, and starts its window anew where it has gone astray.
 """
@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from air.odometry.degradation import Monitor
+from air.odometry.gnss_coupling import GnssCoupling
+from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.initial import KnownSpeed, Refusal
 from air.odometry.initial_prior import Sigmas
 from air.odometry.initial_rest import moving
@@ -30,6 +32,8 @@ JOINED = np.diag([1e-3, 1e-3, 1e-3, 1e-4]) ** 2
 """Of where what began anew is placed: the world is where that is."""
 HALF_GYRO_NS = 10_000_000
 RETRY_S = 5.0
+SILENT_S = 1.0
+"""Without a frame for so long, an epoch stands in for one that shows nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +54,22 @@ class Estimate:
 
 
 class Estimator:
-    """Visual–inertial odometry of tracked frames. Feed it samples and frames in order of time."""
+    """Odometry of tracked frames. Feed it samples and frames in order of time, and epochs to its `gnss`."""
 
-    def __init__(self, focal: float, T_body_cam: SE3, settings: OdometrySettings | None = None) -> None:
+    def __init__(
+        self,
+        focal: float = 1.0,
+        T_body_cam: SE3 | None = None,
+        settings: OdometrySettings | None = None,
+        flight: str = "",
+        base: F64 | None = None,
+    ) -> None:
+        """`base` (3,) m, ECEF, is where a base station stands. Without a camera neither its focal length px nor where
+        it sits matters."""
         self._settings = settings or OdometrySettings()
-        self._focal, self._T_body_cam = focal, T_body_cam
+        self._focal, self._T_body_cam = focal, T_body_cam or SE3.identity()
         self.buffer = ImuBuffer(self._settings.imu)
+        self.gnss = GnssCoupling(self._settings.gnss, self.buffer, flight, base)
         self._integrator = Preintegrator(self._settings.imu)
         self._window: Window | None = None
         self._initialization = self._new_initialization()
@@ -85,8 +99,8 @@ class Estimator:
         if not self.buffer.add(sample) or self._propagation is None:
             return None
         if (sample.t_ns - self._frame_ns) * 1e-9 > self._settings.degradation.alone_s:
-            self._window, self._propagation = None, None
-            self._initialization = self._new_initialization()
+            self._propagation = None
+            self._lose_window()
             self.revision += 1
             return None
         pieces = self.buffer.between(self._propagation.state.t_ns, sample.t_ns)
@@ -108,6 +122,55 @@ class Estimator:
         if self._window is None:
             self._initialization.add_speed(speed)
 
+    # GNSS
+
+    def take_epochs(self) -> list[Estimate]:
+        """Estimates that epochs bring about: the world has been found, or the camera is silent."""
+        out = []
+        for epoch in self.gnss.ready():
+            estimate = None
+            if self._window is None:
+                estimate = self._begin_without_frames(epoch)
+            elif epoch.t_ns - self._frame_ns > SILENT_S * 1e9:
+                outcome = self.add_frame(blind_frame(epoch.t_ns))
+                estimate = outcome if isinstance(outcome, Estimate) else None
+            if self._window is not None:
+                estimate = self._couple(self._window, epoch) or estimate
+            if estimate is not None:
+                out.append(estimate)
+        return out
+
+    def _couple(self, window: Window, epoch: CleanEpoch) -> Estimate | None:
+        if not self.gnss.couple(window, epoch):
+            return None
+        solution = window.settle()
+        self.revision += 1
+        self._monitor.found_gnss()
+        self._propagate_from(window.state())
+        return self._estimate(window, solution, note="the world has been found by GNSS")
+
+    def _begin_without_frames(self, epoch: CleanEpoch) -> Estimate | None:
+        if epoch.t_ns - self._frame_ns < SILENT_S * 1e9:
+            return None
+        found = self.gnss.start.add(epoch, self.buffer, self._settings.imu)
+        if isinstance(found, str):
+            self.gnss.why_not = found
+            return None
+        assert self.gnss.start.datum is not None
+        window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
+        window.begin(found.state, found.covariance, {})
+        self.gnss.join(window, self.gnss.start.datum)
+        self._window, self._monitor = window, Monitor(self._settings.degradation)
+        self._frame_ns = epoch.t_ns
+        self.revision += 1
+        self._propagate_from(found.state)
+        return self._estimate(window, Solution(0.0, 0, 0), note="begins in motion, without a camera")
+
+    def _lose_window(self) -> None:
+        """What follows begins from nothing, but for what satellites broadcast."""
+        self._window, self._initialization = None, self._new_initialization()
+        self.gnss.leave()
+
     def _propagate_from(self, state: InertialState) -> None:
         self._propagation = Propagation(self._integrator, state)
         if (last_ns := self.buffer.last_ns) is not None:
@@ -117,6 +180,8 @@ class Estimator:
 
     def add_frame(self, frame: TrackedFrame) -> Estimate | Refusal:
         """The estimate at a frame that IMU samples cover, or why there is none."""
+        if frame.t_ns <= self._frame_ns:
+            return Refusal("a frame is older than the last one")
         self._frame_ns = frame.t_ns
         self._remember(frame)
         return self._begin(frame) if self._window is None else self._continue(self._window, frame)
@@ -127,7 +192,8 @@ class Estimator:
             return initial
         window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
         first = initial.states[0]
-        window.begin(first, initial.sigmas.covariance(first.T_world_body.R), self._points_at(initial.frames[0], first, {}, initial.depth))
+        covariance = initial.sigmas.covariance(first.T_world_body.R)
+        window.begin(first, covariance, self._points_at(initial.frames[0], first, {}, initial.depth))
         for state, seen in list(zip(initial.states, initial.frames, strict=True))[1:]:
             window.add(seen.t_ns, self._points_at(seen, state, {}, initial.depth), state)
         solution = Solution(0.0, 0, 0)
@@ -187,7 +253,7 @@ class Estimator:
         newest = window.frames[-1]
         # An aircraft that stands needs no points to know where it is.
         points = self._settings.degradation.enough_points if still else len(newest.factors)
-        mode = self._monitor.update(newest.t_ns, points)
+        mode = self._monitor.update(newest.t_ns, points, self.gnss.satellites(newest.t_ns))
         return Estimate(window.state(), window.pose_covariance, mode, self.revision, solution, keyframe, note)
 
     def _points_at(
@@ -238,10 +304,12 @@ class Estimator:
         again = (frame.t_ns - self._repaired_ns) * 1e-9 < RETRY_S
         self._repaired_ns = frame.t_ns
         if again or not np.isfinite(predicted.T_world_body.t).all():
-            self._window, self._initialization = None, self._new_initialization()
+            self._lose_window()
             return Refusal(f"begins anew, because {why}")
         state = self._plausible(predicted)
         window.begin(state, AGAIN.covariance(state.T_world_body.R), self._points_at(frame, state, {}, np.inf))
+        if self.gnss.datum is not None:
+            self.gnss.join(window, self.gnss.datum)
         self._propagate_from(state)
         return self._estimate(window, Solution(0.0, 0, 0), note=f"window started anew: {why}")
 
@@ -251,6 +319,12 @@ class Estimator:
         accel = np.clip(state.accel_bias, -s.accel_bias_sigma, s.accel_bias_sigma)
         gyro = np.clip(state.gyro_bias, -2 * s.gyro_bias_sigma, 2 * s.gyro_bias_sigma)
         return replace(state, accel_bias=accel, gyro_bias=gyro)
+
+
+def blind_frame(t_ns: int) -> TrackedFrame:
+    """A frame that shows nothing."""
+    none = np.zeros(0)
+    return TrackedFrame(t_ns, none.astype(np.int64), np.zeros((0, 2)), np.zeros((0, 3)), none, none.astype(bool), True)
 
 
 def _level_between(now: SE3, wanted: SE3) -> SE3:

@@ -19,7 +19,6 @@ from common.messages import Datum
 from common.se3 import SE3
 
 MIN_VELOCITIES = 4
-MAX_YAW_SIGMA = np.radians(2.0)
 MAX_MISFIT = 3.0
 """Residual velocities may be so many times their sigma, as root mean square."""
 ROUNDS = 4
@@ -44,10 +43,11 @@ class Anchor:
     misfit: float
 
 
-def align_yaw(v_local: F64, v_enu: F64, sigma: F64) -> YawAlignment | str:
+def align_yaw(v_local: F64, v_enu: F64, sigma: F64, most: float) -> YawAlignment | str:
     """The yaw between local velocities (N, 3) m/s and those of Doppler in ENU (N, 3), or why it is not known.
 
-    `sigma` (N,) m/s is of one horizontal component of a pair. The velocities may come at any rate.
+    `sigma` (N,) m/s is of one horizontal component of a pair; the yaw is known with a sigma of at `most` rad. The
+    velocities may come at any rate.
     """
     if len(v_local) < MIN_VELOCITIES:
         return f"{len(v_local)} velocities are too few"
@@ -64,7 +64,7 @@ def align_yaw(v_local: F64, v_enu: F64, sigma: F64) -> YawAlignment | str:
     yaw_sigma = float(max(misfit, 1.0) / np.sqrt(power))
     if misfit > MAX_MISFIT:
         return f"local velocity and Doppler contradict each other: {misfit:.1f} sigmas"
-    if yaw_sigma > MAX_YAW_SIGMA:
+    if yaw_sigma > most:
         return f"yaw known to {np.degrees(yaw_sigma):.1f}° only: it takes moving"
     return YawAlignment(yaw, yaw_sigma, misfit)
 

@@ -18,12 +18,13 @@ import numpy as np
 from air.gnss.gnss_time import SECOND_NS
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssNoise
+from air.odometry.quadratic import Quadratic
 from common.arrays import F64
 
-FORGET_S = 30.0
-"""A satellite that was not seen for so long begins anew."""
+FORGET_S, FORGET_ARC_S = 60.0, 3.0
+"""A satellite that was not seen for so long begins anew; a carrier does in any case."""
 REFERENCE_SYSTEMS = ("G", "G-base")
-SIGMA_SYSTEM, SIGMA_AMBIGUITY = 300.0, 30.0
+SIGMA_SYSTEM, SIGMA_AMBIGUITY = 300.0, 1000.0
 """What is known beforehand of a delay between systems, and of an ambiguity after code was taken off, m."""
 
 
@@ -103,25 +104,25 @@ def needed(epochs: Iterable[CleanEpoch], noise: GnssNoise) -> dict[Bias, tuple[P
     return found
 
 
-def first_node(index: int, t_ns: int, wanted: dict[Bias, tuple[Process, int]]) -> tuple[BiasNode, gtsam.JacobianFactor]:
-    """A node with nothing before it, and its prior."""
+def first_node(index: int, t_ns: int, wanted: dict[Bias, tuple[Process, int]]) -> tuple[BiasNode, Quadratic]:
+    """A node with nothing before it, and what is known of it, at the values that are expected."""
     node = _node(index, t_ns, {bias: one for bias, one in wanted.items() if np.isfinite(one[0].mean)})
+    u = np.array([process.mean for process in node.processes])
     sigma = np.array([process.sigma for process in node.processes])
-    model = gtsam.noiseModel.Diagonal.Sigmas(sigma)
-    return node, gtsam.JacobianFactor(node.key, np.eye(len(node)), np.zeros(len(node)), model)
+    return node, Quadratic({node.key: u}, np.diag(sigma**-2.0), np.zeros(len(node)))
 
 
 def next_node(
     before: BiasNode, u_before: F64, t_ns: int, wanted: dict[Bias, tuple[Process, int]]
-) -> tuple[BiasNode, F64, gtsam.JacobianFactor]:
-    """The node after another, where its biases (D,) are expected, and the factor between both, linear there.
+) -> tuple[BiasNode, Quadratic]:
+    """The node after another, and what joins both, at the values that are expected.
 
     `u_before` (C,) are the biases of the node before. Those not seen any more for a while are left behind.
     """
     kept = {
         bias: (before.processes[i], before.seen_ns[i])
         for bias, i in before.biases.items()
-        if t_ns - before.seen_ns[i] <= FORGET_S * SECOND_NS
+        if t_ns - before.seen_ns[i] <= (FORGET_ARC_S if "/" in bias[1] else FORGET_S) * SECOND_NS
     }
     new = {bias: one for bias, one in wanted.items() if bias in kept or np.isfinite(one[0].mean)}
     node = _node(before.index + 1, t_ns, kept | new)
@@ -139,14 +140,10 @@ def next_node(
         else:
             mean[column], sigma[column] = process.mean, process.sigma
     u = A @ u_before + mean
-    model = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigma, 1e-5))
-    # Linear in both, about u_before and u: the error there is zero.
-    return node, u, gtsam.JacobianFactor(before.key, -A, node.key, np.eye(len(node)), np.zeros(len(node)), model)
-
-
-def start_values(node: BiasNode) -> F64:
-    """Where the biases (D,) of a first node are expected."""
-    return np.array([process.mean for process in node.processes])
+    W = np.maximum(sigma, 1e-5) ** -2.0
+    WA = W[:, None] * A
+    G = np.block([[A.T @ WA, -WA.T], [-WA, np.diag(W)]])
+    return node, Quadratic({before.key: u_before, node.key: u}, G, np.zeros(len(G)))
 
 
 def _node(index: int, t_ns: int, wanted: dict[Bias, tuple[Process, int]]) -> BiasNode:

@@ -81,12 +81,19 @@ def antenna_motion(
 
 
 def linearise(
-    epoch: CleanEpoch, motion: AntennaMotion, node: BiasNode, u: F64, T_ecef_world: SE3, robust: float
+    epoch: CleanEpoch,
+    motion: AntennaMotion,
+    node: BiasNode,
+    u: F64,
+    T_ecef_world: SE3,
+    robust: float,
+    line_carrier: F64 | None = None,
 ) -> Linearised:
     """The code, carrier and Doppler of an epoch as a factor, linear at `motion` and at the biases `u` (D,) of a node.
 
     Rows beyond `robust` sigmas lose weight: infinite for biases that were not adjusted yet, which explain residuals of
-    metres. Rows whose biases the node does not have are left out.
+    metres. Rows whose biases the node does not have are left out. `line_carrier` (N, 3) are the directions, in world,
+    along which carriers are held to see the antenna move.
     """
     p = T_ecef_world.apply(motion.p_world)
     v = T_ecef_world.R @ motion.v_world
@@ -97,6 +104,10 @@ def linearise(
     by_position[:, :STATES] = -line_world @ motion.p_by_state
     by_velocity = np.zeros((len(line), width))
     by_velocity[:, :STATES] = -line_world @ motion.v_by_state
+    by_way = by_position
+    if line_carrier is not None:
+        by_way = np.zeros_like(by_position)
+        by_way[:, :STATES] = -line_carrier @ motion.p_by_state
     systems = _columns(node, Kind.SYSTEM, epoch.systems)
     multipath, slow = (_columns(node, kind, epoch.satellites) for kind in (Kind.MULTIPATH, Kind.SLOW))
     ambiguity = _columns(node, Kind.AMBIGUITY, epoch.arcs)
@@ -116,7 +127,7 @@ def linearise(
         return H, measured[which] - expected[which] - H[:, STATES:] @ values[STATES:]
 
     H_code, r_code = rows(code, by_position, epoch.code, distance, (multipath, 1.0), (slow, 1.0), (systems, 1.0))
-    H_carrier, r_carrier = rows(carrier, by_position, epoch.carrier, distance, (ambiguity, 1.0), (drift, since_s))
+    H_carrier, r_carrier = rows(carrier, by_way, epoch.carrier, distance, (ambiguity, 1.0), (drift, since_s))
     H_rate, r_rate = rows(rate, by_velocity, epoch.rate, _range_rates(epoch, p, v, line), (drift, 1.0))
     ranging = _eliminated(
         np.vstack([H_code, H_carrier]),
@@ -136,33 +147,6 @@ def total(parts: Sequence[Linearised]) -> Linearised:
         rows=sum(part.rows for part in parts),
         chi_square=sum(part.chi_square for part in parts),
     )
-
-
-def as_factor(linear: Linearised, keys: Sequence[int], values: gtsam.Values) -> gtsam.LinearContainerFactor:
-    """The factor on the keys of pose, velocity, IMU biases and node (if it has one), linear at `values`."""
-    G, g = linear.G, linear.g[:, None]
-    X, V, B, N = POSE, VELOCITY, BIAS, slice(STATES, len(g))
-    if len(keys) == 3:
-        whole = gtsam.HessianFactor(
-            *keys, G[X, X], G[X, V], G[X, B], g[X], G[V, V], G[V, B], g[V], G[B, B], g[B], linear.f
-        )
-        return gtsam.LinearContainerFactor(whole, values)
-    x, v, b, n = keys
-    none, size = np.zeros((6, 1)), len(g) - STATES
-    zero_v, zero_n = np.zeros((3, 3)), np.zeros((size, size))
-    # gtsam takes up to three keys at once in Python: the sum of these is the whole.
-    parts = gtsam.GaussianFactorGraph()
-    parts.push_back(
-        gtsam.HessianFactor(x, v, n, G[X, X], G[X, V], G[X, N], g[X], G[V, V], G[V, N], g[V], G[N, N], g[N], linear.f)
-    )
-    parts.push_back(gtsam.HessianFactor(x, b, np.zeros((6, 6)), G[X, B], none, G[B, B], g[B], 0.0))
-    parts.push_back(
-        gtsam.HessianFactor(
-            v, b, n, zero_v, G[V, B], np.zeros((3, size)), np.zeros((3, 1)),
-            np.zeros((6, 6)), G[B, N], none, zero_n, np.zeros((size, 1)), 0.0,
-        )
-    )  # fmt: skip
-    return gtsam.LinearContainerFactor(gtsam.HessianFactor(parts), values)
 
 
 def _columns(node: BiasNode, kind: Kind, names: Sequence[str]) -> I64:

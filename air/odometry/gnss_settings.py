@@ -56,7 +56,7 @@ class GnssNoise:
     troposphere: Sigma = 0.15
     slow_s: Seconds = 1800.0
     drift: Sigma = 0.003
-    orbit_drift: Sigma = 0.001
+    orbit_drift: Sigma = 0.0005
     drift_s: Seconds = 600.0
     ambiguity_walk: Sigma = 0.001
     system_walk: Sigma = 0.01
@@ -70,10 +70,15 @@ class GnssSettings:
 
     `p_body_antenna` (x, y, z) m is the lever arm. Biases of satellites stay the same for `node_s`. Epochs older than
     `max_age_s` without a position of their own are not used.
+
+    Pseudoranges place the world once, and again when the position's sigma has grown by the factor `reanchor`. In
+    between, Doppler and carrier alone move the aircraft: what pseudoranges still learn about where the world lies would
+    make poses creep by metres, and the map with them. Differences to a base station learn all the time.
     """
 
     p_body_antenna: tuple[float, ...] = (0.0, 0.0, 0.0)
     node_s: Seconds = 2.0
     max_age_s: Seconds = 60.0
+    reanchor: Annotated[float, Range(1.0, 1000.0)] = 1.5
     selection: GnssSelection = field(default_factory=GnssSelection)
     noise: GnssNoise = field(default_factory=GnssNoise)

@@ -36,8 +36,8 @@ class Sigmas:
 def initial_prior(k: int, state: InertialState, covariance: F64, imu: ImuSettings) -> Quadratic:
     """The state of frame k, known within a covariance (15, 15); its biases are also those that such a device has."""
     point = {X(k): to_pose3(state.T_world_body), V(k): state.v_world, B(k): state.bias.vector()}
-    G, g = np.linalg.inv(covariance), np.zeros(15)
-    made = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3) ** -2.0
+    G, g = np.asarray(np.linalg.inv(covariance), np.float64), np.zeros(15)
+    made: F64 = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3) ** -2.0
     G[9:, 9:] += np.diag(made)
     g[9:] -= made * state.bias.vector()
     return Quadratic(point, G, g)

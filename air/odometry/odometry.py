@@ -16,10 +16,12 @@ from air.odometry.tracker import Tracker
 from air.sensors.calibration import Calibration
 from common.arrays import F64, U8
 from common.gravity import normal_gravity
-from common.measurements import CameraFrame, Encoding, FixKind, ImuSample, Measurement, ReceiverSolution
-from common.messages import EstimatorState, Keyframe, Mode, Photo, Pose
+from common.measurements import CameraFrame, Encoding, FixKind, GnssEpoch, ImuSample, Measurement, ReceiverSolution
+from common.messages import Datum, EstimatorState, Keyframe, Mode, Photo, Pose
 
-Output = Pose | Keyframe | EstimatorState
+Output = Pose | Keyframe | EstimatorState | Datum
+BASE = "base"
+"""Name of the base station's receiver."""
 WAITING = 60
 """Frames that wait for the IMU; older ones are given up."""
 MIN_SIGMA_SPEED, UNKNOWN_SIGMA_SPEED = 0.1, 0.5
@@ -32,18 +34,22 @@ class Odometry:
     """Feed it measurements in the order in which they came; it answers with what they tell.
 
     One camera is followed, whose calibration it is given. `world` is level; its origin and heading are those of the
-    first pose.
+    first pose until GNSS has told where it lies: from then on it is east, north, up at the `Datum` that is told.
     """
 
-    def __init__(self, calibration: Calibration, flight: str, settings: OdometrySettings | None = None) -> None:
-        """Raises ValueError for a calibration that does not say where the camera sits on the body."""
+    def __init__(
+        self, calibration: Calibration, flight: str, settings: OdometrySettings | None = None, base: F64 | None = None
+    ) -> None:
+        """`base` (3,) m, ECEF, is where a base station stands. Raises ValueError for a calibration that does not say
+        where the camera sits on the body."""
         if calibration.T_body_cam is None:
             raise ValueError("the calibration lacks T_body_cam")
         self._settings = settings or OdometrySettings()
         self._calibration, self._flight = calibration, flight
         self._camera, self._T_body_cam = calibration.camera, calibration.T_body_cam
         self.tracker = Tracker(self._camera, self._settings.tracker)
-        self.estimator = Estimator(self._camera.fx, self._T_body_cam, self._settings)
+        self.estimator = Estimator(self._camera.fx, self._T_body_cam, self._settings, flight, base)
+        self._datum: Datum | None = None
         self._waiting: deque[tuple[int, CameraFrame]] = deque(maxlen=WAITING)
         self._tracked_ns: int | None = None
         self._solved_ns = self._told_ns = -(10**18)
@@ -63,9 +69,14 @@ class Odometry:
         if isinstance(message, ImuSample):
             state = self.estimator.add_imu(message)
             poses: list[Output] = [] if state is None else [self._pose(state)]
-            return poses + self._frames()
+            return poses + self._frames() + self._epochs()
         if isinstance(message, ReceiverSolution):
             self._learn(message)
+        elif isinstance(message, GnssEpoch):
+            gnss = self.estimator.gnss
+            gnss.add_base(message) if message.receiver == BASE else gnss.add_epoch(message)
+        else:
+            self.estimator.gnss.add(message)
         return []
 
     def _learn(self, solution: ReceiverSolution) -> None:
@@ -85,6 +96,10 @@ class Odometry:
         while self._waiting and last_ns is not None and self._waiting[0][0] <= last_ns:
             out += self._frame(*self._waiting.popleft())
         return out
+
+    def _epochs(self) -> list[Output]:
+        """What the waiting GNSS epochs tell that IMU samples cover by now."""
+        return [output for estimate in self.estimator.take_epochs() for output in self._tell(estimate)]
 
     def _frame(self, t_ns: int, frame: CameraFrame) -> list[Output]:
         image = decoded(frame)
@@ -124,6 +139,9 @@ class Odometry:
         if estimate.note:
             self.notes.append((estimate.state.t_ns, estimate.note))
         out: list[Output] = []
+        if (datum := self.estimator.gnss.datum) is not None and datum is not self._datum:
+            self._datum = datum
+            out.append(datum)
         if estimate.keyframe is not None:
             out.append(self._keyframe(estimate.keyframe))
         if estimate.state.t_ns - self._told_ns >= EVERY_NS:
@@ -169,7 +187,7 @@ class Odometry:
             T_body_cam=self._T_body_cam,
             time_offset_s=self._calibration.time_offset_s,
             points=estimate.solution.points,
-            satellites=0,
+            satellites=self.estimator.gnss.satellites(state.t_ns),
             reprojection_rms_px=estimate.solution.rms_px,
         )
 

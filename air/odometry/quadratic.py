@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -19,8 +20,8 @@ import numpy as np
 from common.arrays import F64, I64
 from common.se3 import SE3
 
-Variable = gtsam.Pose3 | F64
-"""A pose, or a vector; IMU biases are the vector of accelerometer and gyroscope."""
+Variable = Any
+"""A `gtsam.Pose3`, or a vector (D,); IMU biases are the vector of accelerometer and gyroscope."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ class Quadratic:
             columns = slice(begin, begin + size)
             begin += size
             point[key] = carried(key, then, T_new_world)
-            J[columns] = _by_world(key, point[key], T_new_world.t)
+            J[columns] = by_world(key, point[key], T_new_world.t)
             if key >> 56 in (_POINT, _VELOCITY):  # these are held in axes of the world
                 _turn(G, g, columns, T_new_world.R.T)
         GJ = G @ J
@@ -79,6 +80,11 @@ class NormalEquations:
         self._columns = {key: np.arange(a, b) for key, a, b in zip(sizes, ends, ends[1:], strict=False)}
         self.G, self.g = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
 
+    @property
+    def keys(self) -> list[int]:
+        """The variables in their order."""
+        return list(self._columns)
+
     def add(self, keys: Iterable[int], G: F64, g: F64) -> None:
         """Add a function of some of the variables."""
         columns = self.columns(keys)
@@ -89,16 +95,33 @@ class NormalEquations:
         """Where some of the variables are."""
         return np.concatenate([self._columns[key] for key in keys])
 
-    def solve(self, covariance_of: Sequence[int]) -> tuple[dict[int, F64], F64]:
-        """The change of each variable, and the covariance of some together. Raises LinAlgError where undetermined."""
-        columns = self.columns(covariance_of)
-        wanted = np.zeros((len(self.g), len(columns)))
+    def solve(self, covariance_of: Sequence[int], first: Sequence[int] = ()) -> tuple[dict[int, F64], F64]:
+        """The change of each variable, and the covariance of some together. Raises LinAlgError where undetermined.
+
+        What is eliminated `first`, key by key, costs little where it is linked to few others. It has no covariance.
+        """
+        G, g, left, ways = self.G.copy(), self.g.copy(), np.ones(len(self.g), bool), []
+        for key in first:
+            own = self._columns[key]
+            left[own] = False
+            others = np.flatnonzero(left & (G[own] != 0.0).any(axis=0))
+            G_others = G[np.ix_(own, others)]
+            way = _solve(G[np.ix_(own, own)], np.column_stack([G_others, g[own]]))
+            G[np.ix_(others, others)] -= G_others.T @ way[:, :-1]
+            g[others] -= G_others.T @ way[:, -1]
+            ways.append((own, others, way))
+        rest, columns = np.flatnonzero(left), self.columns(covariance_of)
+        wanted = np.zeros((len(g), len(columns)))
         wanted[columns, np.arange(len(columns))] = 1.0
-        found = _solve(self.G, np.column_stack([self.g, wanted]))
-        return {key: found[c, 0] for key, c in self._columns.items()}, found[columns, 1:]
+        found, change = _solve(G[np.ix_(rest, rest)], np.column_stack([g, wanted])[rest]), np.zeros(len(g))
+        change[rest] = found[:, 0]
+        for own, others, way in reversed(ways):
+            change[own] = way[:, -1] - way[:, :-1] @ change[others]
+        covariance = found[np.searchsorted(rest, columns), 1:]
+        return {key: change[c] for key, c in self._columns.items()}, covariance
 
     def without(self, leaving: Sequence[int], values: gtsam.Values) -> Quadratic:
-        """What the sum knows of the others after some variables left. Raises LinAlgError where they are undetermined."""
+        """What the sum knows of the others after some left. Raises LinAlgError where these are undetermined."""
         staying = [key for key in self._columns if key not in set(leaving)]
         a, b = self.columns(leaving), self.columns(staying)
         way = _solve(self.G[np.ix_(a, a)], np.column_stack([self.G[np.ix_(a, b)], self.g[a]]))
@@ -140,7 +163,7 @@ def _flat(then: Variable) -> F64:
 
 def _moved(then: Variable, now: Variable) -> F64:
     if not isinstance(then, gtsam.Pose3):
-        return now - then
+        return np.asarray(now - then)
     turned = gtsam.Rot3.Logmap(then.rotation().between(now.rotation()))
     return np.concatenate([turned, then.rotation().matrix().T @ (now.translation() - then.translation())])
 
@@ -162,7 +185,7 @@ def _turn(G: F64, g: F64, columns: slice, R_then_now: F64) -> None:
     G[columns] = R_then_now.T @ G[columns]
 
 
-def _by_world(key: int, now: Variable, origin: F64) -> F64:
+def by_world(key: int, now: Variable, origin: F64) -> F64:
     """How a variable (D, 4) moves when the new world is shifted, and turned about the vertical through `origin`."""
     up = np.array([0.0, 0.0, 1.0])
     if isinstance(now, gtsam.Pose3):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from air.odometry.gnss_settings import GnssSettings
 from common.config import Range
 
 
@@ -55,14 +56,16 @@ class WindowSettings:
     """Settings of the sliding window; px of the full image.
 
     A frame becomes a keyframe once points moved by `parallax_deg` beyond what turning does since the last one, fewer
-    than `overlap` of them are left, or after `longest_s`. A point needs `min_angle_deg` between its rays. Observations
-    beyond `max_residual` sigmas are outliers. Up to `anchored` points outlive the keyframes that saw them.
+    than `overlap` of them are left, or after `longest_s`, and every `blind_s` while nothing is seen. A point needs
+    `min_angle_deg` between its rays. Observations beyond `max_residual` sigmas are outliers. Up to `anchored` points
+    outlive the keyframes that saw them.
     """
 
     keyframes: Annotated[int, Range(3, 50)] = 10
     parallax_deg: Annotated[float, Range(0.01, 45.0)] = 2.0
     overlap: Annotated[float, Range(0.0, 1.0)] = 0.6
     longest_s: Annotated[float, Range(0.1, 100.0)] = 3.0
+    blind_s: Annotated[float, Range(0.1, 100.0)] = 0.9
     pixel_sigma: Annotated[float, Range(0.05, 10.0)] = 1.0
     min_angle_deg: Annotated[float, Range(0.05, 45.0)] = 1.0
     max_residual: Annotated[float, Range(1.0, 100.0)] = 4.0
@@ -106,7 +109,7 @@ class DegradationSettings:
     enough_satellites: Annotated[int, Range(1, 100)] = 6
     lost_s: Annotated[float, Range(0.0, 60.0)] = 1.0
     back_s: Annotated[float, Range(0.0, 60.0)] = 0.5
-    alone_s: Annotated[float, Range(0.1, 600.0)] = 2.0
+    alone_s: Annotated[float, Range(0.1, 600.0)] = 5.0
     velocity_jump: Annotated[float, Range(0.1, 100.0)] = 2.0
     bias_sigmas: Annotated[float, Range(1.0, 100.0)] = 6.0
 
@@ -121,4 +124,5 @@ class OdometrySettings:
     imu: ImuSettings = field(default_factory=ImuSettings)
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
+    gnss: GnssSettings = field(default_factory=GnssSettings)
     degradation: DegradationSettings = field(default_factory=DegradationSettings)

@@ -15,17 +15,17 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
+from air.odometry.adjustment import Unknowns, adjust, equations_of
 from air.odometry.initial_prior import initial_prior
 from air.odometry.landmarks import View, locate, outliers, rms_px
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
-from air.odometry.quadratic import NormalEquations, Quadratic, carried, dimension, variable
+from air.odometry.quadratic import Quadratic, by_world, carried, variable
 from air.odometry.settings import ImuSettings, WindowSettings
 from common.arrays import F64
 from common.se3 import SE3
 
 noise = gtsam.noiseModel
 HUBER = 1.345
-TOLERANCE = 1e-4
 WEAK = 100.0
 """Sigma of the prior of a point, in distances of the point."""
 TRIALS, SETTLING = 5, 6
@@ -100,6 +100,14 @@ class Window:
         bias = self.values.atConstantBias(B(frame.k))
         pose, v_world = from_pose3(self.values.atPose3(X(frame.k))), self.values.atVector(V(frame.k))
         return InertialState(frame.t_ns, pose, v_world, bias.accelerometer(), bias.gyroscope())
+
+    def state_at(self, t_ns: int) -> InertialState | None:
+        """The state at a time that IMU samples cover; None before the first frame."""
+        for index in range(len(self.frames) - 1, -1, -1):
+            if self.frames[index].t_ns <= t_ns:
+                state = self.state(index)
+                return self.preintegrator.predict(state, self._imu.between(state.t_ns, t_ns))
+        return None
 
     @property
     def pose_covariance(self) -> F64:
@@ -193,7 +201,7 @@ class Window:
         """Adjust everything in the window; what turns out to be an outlier leaves."""
         for _ in range(TRIALS):
             try:
-                iterations = self._gauss_newton()
+                iterations = self._adjust()
                 break
             except RuntimeError as error:  # gtsam names an undetermined variable
                 if not self._remove_named(str(error)):
@@ -219,8 +227,12 @@ class Window:
         """Turn everything about the vertical and shift it; `covariance` (4, 4) is of the shift m and the turn rad."""
         assert self._prior is not None
         self._prior = self._prior.carried(T_new_world, covariance)
-        for key in [key for f in self.frames for key in (X(f.k), V(f.k))] + [L(i) for i in self.points]:
+        moving = [key for f in self.frames for key in (X(f.k), V(f.k))] + [L(i) for i in self.points]
+        for key in moving:
             self.values.update(key, carried(key, variable(self.values, key), T_new_world))
+        newest = X(self.frames[-1].k)
+        J = by_world(newest, variable(self.values, newest), T_new_world.t)
+        self._covariance = self._covariance + J @ covariance @ J.T
 
     def _remove_named(self, error: str) -> bool:
         named = re.search(r"Symbol: l(\d+)", error)
@@ -229,37 +241,20 @@ class Window:
         self._forget(int(named[1]))
         return True
 
-    def _gauss_newton(self) -> int:
+    def _adjust(self) -> int:
         """Iterations that it took."""
-        graph, linear = self._graph(), self._known()
-        values, error = self.values, _error(graph, linear, self.values)
-        iterations = 0
-        while iterations < self._settings.iterations:
-            iterations += 1
-            change, covariance = self._step(graph, [known.at(values) for known in linear], values)
-            new = values.retract(change)
-            new_error = _error(graph, linear, new)
-            if not np.isfinite(new_error) or new_error > error:
-                break
-            self._covariance = covariance
-            improved, values, error = error - new_error, new, new_error
-            if improved < TOLERANCE * error:
-                break
-        self.values = values
-        return iterations
-
-    def _step(
-        self, graph: gtsam.NonlinearFactorGraph, linear: list[Quadratic], values: gtsam.Values
-    ) -> tuple[gtsam.VectorValues, F64]:
-        """The change of all values, and the covariance of the newest pose; points are eliminated first."""
-        points = gtsam.Ordering([L(i) for i in sorted(self.points - self._anchored)])
-        net, rest = graph.linearize(values).eliminatePartialSequential(points)
-        equations = _equations(rest, linear, values)
-        change, covariance = equations.solve([X(self.frames[-1].k)])
-        moved = gtsam.VectorValues()
-        for key, delta in change.items():
-            moved.insert(key, delta)
-        return net.optimize(moved), covariance
+        known = self._known()
+        frames = [key for f in self.frames for key in (V(f.k), B(f.k), X(f.k))]
+        anchored = [L(i) for i in self._anchored]
+        others = {key for one in known for key in one.point}.difference(frames, anchored)
+        unknowns = Unknowns(
+            points=[L(i) for i in sorted(self.points - self._anchored)],
+            chain=sorted(others),
+            poses=[X(f.k) for f in self.frames],
+        )
+        adjusted = adjust(self._graph(), known, self.values, unknowns, self._settings.iterations)
+        self.values, self._covariance = adjusted.values, adjusted.covariance
+        return adjusted.iterations
 
     def _known(self) -> list[Quadratic]:
         """What is known beside the factors that gtsam knows."""
@@ -335,6 +330,8 @@ class Window:
         common = sorted(last.xy.keys() & frame.xy.keys())
         if (frame.t_ns - last.t_ns) * 1e-9 > self._settings.longest_s:
             return True
+        if not last.xy and not frame.xy:
+            return (frame.t_ns - last.t_ns) * 1e-9 > self._settings.blind_s
         if len(common) < self._settings.overlap * max(len(frame.xy), 1):
             return True
         a, b = (np.array([f.xy[i] for i in common]) for f in (last, frame))
@@ -363,6 +360,7 @@ class Window:
             del oldest.factors[i], oldest.xy[i]
         self._drop_lonely()
         leaving = [*(L(i) for i in gone if i in self._anchored), V(oldest.k), B(oldest.k), X(oldest.k)]
+        assert self._prior is not None
         known = [self._prior]
         if self.companion is not None:
             others, more = self.companion.leaving(self, oldest.k)
@@ -370,8 +368,7 @@ class Window:
         points = gtsam.Ordering([L(i) for i in gone if i not in self._anchored])
         linear = self._graph_of(oldest, gone).linearize(self.values)
         rest = linear.eliminatePartialSequential(points)[1]
-        at_values = [one.at(self.values) for one in known if one is not None]
-        self._prior = _equations(rest, at_values, self.values).without(leaving, self.values)
+        self._prior = equations_of(rest, known, self.values).without(leaving, self.values)
         self._anchored = kept
         for i in gone:
             self._forget(i)
@@ -399,22 +396,3 @@ class Window:
         rivals = sorted((oldest.factors.keys() & self.points) - ended - already)
         rivals.sort(key=lambda i: -sum(i in frame.factors for frame in self.frames))
         return already | set(rivals[: max(0, self._settings.anchored - len(already))])
-
-
-def _equations(rest: gtsam.GaussianFactorGraph, linear: list[Quadratic], values: gtsam.Values) -> NormalEquations:
-    """The sum of gtsam's linear factors and of what else is known."""
-    keys = {key: None for key in sorted(rest.keyVector())}
-    for known in linear:
-        keys |= dict.fromkeys(known.point)
-    equations = NormalEquations({key: dimension(values, key) for key in keys})
-    mine = rest.keyVector()
-    if mine:
-        G, g = rest.hessian(gtsam.Ordering(mine))
-        equations.add(mine, G, g)
-    for known in linear:
-        equations.add(known.point, known.G, known.g)
-    return equations
-
-
-def _error(graph: gtsam.NonlinearFactorGraph, linear: list[Quadratic], values: gtsam.Values) -> float:
-    return float(graph.error(values)) + sum(known.error(values) for known in linear)
