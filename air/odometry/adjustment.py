@@ -11,6 +11,8 @@ import numpy as np
 from air.odometry.quadratic import NormalEquations, Quadratic, dimension
 from common.arrays import F64
 
+HALVINGS = 4
+"""How often a step that leads uphill is halved."""
 TOLERANCE, SMALL_TURN, SMALL_SHIFT = 1e-4, 2e-4, 0.005
 """Iterations end when the error falls by less than a share, or poses move by less than rad and m."""
 
@@ -51,9 +53,8 @@ def adjust(
     while done < iterations:
         done += 1
         change, covariance = _step(graph, known, values, unknowns)
-        new = values.retract(change)
-        new_error = _error(graph, known, new)
-        if not np.isfinite(new_error) or new_error > error:
+        new, new_error = _descent(graph, known, values, change, error)
+        if not new_error <= error:
             break
         improved, values, error = error - new_error, new, new_error
         if improved < TOLERANCE * error or _is_small(change, unknowns.poses):
@@ -90,6 +91,29 @@ def _step(
 def _is_small(change: gtsam.VectorValues, poses: Sequence[int]) -> bool:
     moved = np.abs([change.at(key) for key in poses])
     return bool(moved[:, :3].max() < SMALL_TURN and moved[:, 3:].max() < SMALL_SHIFT)
+
+
+def _descent(
+    graph: gtsam.NonlinearFactorGraph,
+    known: Sequence[Quadratic],
+    values: gtsam.Values,
+    change: gtsam.VectorValues,
+    error: float,
+) -> tuple[gtsam.Values, float]:
+    """The values after a change and their error; after a part of it where all of it leads uphill.
+
+    Along a scale that is hardly known the valley is long and curved.
+    """
+    for _ in range(HALVINGS):
+        new = values.retract(change)
+        new_error = _error(graph, known, new)
+        if new_error <= error:
+            return new, new_error
+        half = gtsam.VectorValues()
+        for key in values.keys():  # noqa: SIM118
+            half.insert(key, 0.5 * change.at(key))
+        change = half
+    return values, float("inf")
 
 
 def _error(graph: gtsam.NonlinearFactorGraph, known: Sequence[Quadratic], values: gtsam.Values) -> float:

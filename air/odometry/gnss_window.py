@@ -76,9 +76,9 @@ class GnssWindow:
         self._adjusted = -1
 
     def add(self, window: Window, epoch: CleanEpoch) -> bool:
-        """Take an epoch that IMU samples cover; whether there is a keyframe before it."""
+        """Take an epoch that IMU samples cover; whether a keyframe lies before it, and the IMU tells the way there."""
         keyframe = _before(window.frames, epoch.t_ns)
-        if keyframe is None:
+        if keyframe is None or self._imu.between(keyframe.t_ns, epoch.t_ns).doubtful.any():
             return False
         if not self._differential:
             epoch = self._renewed(epoch)
