@@ -21,6 +21,8 @@ from common.se3 import SE3
 MIN_VELOCITIES = 4
 MAX_MISFIT = 3.0
 """Residual velocities may be so many times their sigma, as root mean square."""
+SIGMA_SYSTEM = 300.0
+"""What is known beforehand of a delay between systems, m: where none of the first is seen, all may be shifted."""
 ROUNDS = 4
 _CONVERGED = 1e-3
 
@@ -84,11 +86,12 @@ def find_anchor(p_odom: F64, epochs: Sequence[CleanEpoch], yaw: float, near: F64
     R_ecef_odom = R_ecef_enu @ R_enu_odom
     origin = near - R_ecef_odom @ np.mean([p for p, _ in usable], axis=0)
     systems = sorted({name for _, epoch in usable for name in epoch.systems})[1:]
+    known = np.diag([0.0, 0.0, 0.0, *np.full(len(systems), SIGMA_SYSTEM**-2.0)])
     normal, misfit = np.eye(3), np.inf
     for _ in range(ROUNDS):
         parts = [_rows(epoch, origin + R_ecef_odom @ p, R_ecef_enu, systems) for p, epoch in usable]
         H, r = np.vstack([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-        normal = H.T @ H
+        normal = H.T @ H + known
         if np.linalg.cond(normal) > 1e12:
             return "ranges do not determine the anchor"
         step = np.linalg.solve(normal, H.T @ r)
