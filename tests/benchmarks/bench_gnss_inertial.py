@@ -13,42 +13,33 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from error_sources import GNSS
 from figures import recording
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gnss_flight import BASE_ECEF, DATUM, errors, flight
+from gnss_flight import BASE_ECEF, DATUM, errors, estimates, flight
 from tqdm import tqdm
 
 from air.gnss.ephemerides import Ephemerides
 from air.gnss.gnss_time import SECOND_NS, to_week
 from air.gnss.positioning import PointPosition, find_position
 from air.gnss.settings import PositioningSettings
-from air.odometry.gnss_inertial import GnssInertial, GnssInertialSettings
+from air.odometry.estimator import Estimator
 from air.odometry.gnss_settings import GnssNoise, GnssSelection, GnssSettings
-from air.odometry.settings import ImuSettings
+from air.odometry.settings import ImuSettings, OdometrySettings
 from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.motion.mission import FlightOptions
 from air.sources.source import open_source
 from common.geo import T_ecef_enu, T_world_other, ecef_to_geodetic
+from common.gravity import normal_gravity
 from common.measurements import GnssEpoch, ImuSample
 from common.messages import Datum
 from ground.evaluation.similarity import umeyama
 
 SEEDS = range(1, 6)
 IN_THE_AIR = FlightOptions(start="air")
-SOURCES = {
-    "all on": {},
-    "orbits and satellite clocks": {"orbit": 0.0, "satellite_clock": 0.0},
-    "ionosphere beyond the model": {"ionosphere_residual": 0.0},
-    "troposphere beyond the model": {"troposphere_residual": 0.0},
-    "receiver's clock": {"clock": 0.0, "clock_drift_ppm": 0.0, "inter_system": 0.0},
-    "multipath of the code": {"multipath": 0.0},
-    "noise of the code": {"code": 0.0},
-    "noise of the Doppler": {"doppler": 0.0},
-    "noise and multipath of the carrier": {"phase": 0.0, "carrier_multipath": 0.0},
-    "slips and half cycles": {"slips": 0.0, "half_cycle": 0},
-}
+IMU = ImuSettings(gravity=normal_gravity(DATUM.latitude_deg, DATUM.height))
 
 
 def main():
@@ -77,7 +68,7 @@ def flights(seconds):
 def budget(seconds):
     """What is left when each error of the simulated GNSS is turned off in turn."""
     print("| turned off | code and Doppler | after alignment | with carrier | after alignment |\n|---|---|---|---|---|")
-    for name, off in tqdm(SOURCES.items(), "errors", disable=None):
+    for name, off in tqdm(({"nothing": {}} | GNSS).items(), "errors", disable=None):
         flown = flight(2, seconds, IN_THE_AIR, gnss=GnssOptions(**off))
         cells = [cell for carrier in (False, True) for cell in figures_of(flown, carrier, None, seconds)[0][1:3]]
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
@@ -87,15 +78,15 @@ def budget(seconds):
 def figures_of(flown, carrier, base, seconds):
     """Cells of a row, and the NEES."""
     gnss = GnssSettings(p_body_antenna=flown.p_body_antenna, selection=GnssSelection(carrier=carrier))
-    estimator = GnssInertial(GnssInertialSettings(gnss, ImuSettings()), base)
+    estimator = Estimator(settings=OdometrySettings(gnss=gnss, imu=IMU), base=base)
     begun = time.process_time()
-    poses = [pose for message in flown.messages for pose in estimator.feed(message)]
+    poses = estimates(estimator, flown.messages)
     spent_s = time.process_time() - begun
-    poses = [pose for pose in poses if pose.anchored]
-    if not poses:
+    datum = estimator.gnss.datum
+    if datum is None or not poses:
         return (["never"] + ["–"] * 5), np.nan
-    off, squares = errors(flown, poses)
-    ours = np.array([(T_world_other(DATUM, pose.datum) @ pose.state.T_world_body).t for pose in poses])
+    off, squares = errors(flown, poses, datum)
+    ours = np.array([(T_world_other(DATUM, datum) @ pose.state.T_world_body).t for pose in poses])
     left = np.linalg.norm(umeyama(ours, ours - off, with_scale=False).apply(ours) - (ours - off), axis=1)
     since_s = (poses[0].state.t_ns - flown.start_ns) / SECOND_NS
     rmse, aligned, most = rms(np.linalg.norm(off, axis=1)), rms(left), left.max()
@@ -125,10 +116,11 @@ def car():
     moved = [replace(item, t_ns=item.t_ns - shift_ns) if isinstance(item, ImuSample) else item for item in items]
     moved = sorted(moved, key=lambda item: item.t_ns if isinstance(item, ImuSample | GnssEpoch) else 0)
     imu = ImuSettings(accel_noise=0.05, gyro_noise=0.002, accel_bias_sigma=0.3, gyro_bias_sigma=0.1)
-    estimator = GnssInertial(GnssInertialSettings(GnssSettings(noise=GnssNoise(rate=0.15, multipath=1.5)), imu))
-    poses = [pose for message in moved for pose in estimator.feed(message)]
+    gnss = GnssSettings(noise=GnssNoise(rate=0.15, multipath=1.5))
+    estimator = Estimator(settings=OdometrySettings(gnss=gnss, imu=imu))
+    poses, datum = estimates(estimator, moved), estimator.gnss.datum
     own_s = np.array([to_week(pose.state.t_ns)[1] for pose in poses])
-    own = np.array([T_ecef_enu(pose.datum).apply(pose.state.T_world_body.t) for pose in poses])
+    own = T_ecef_enu(datum).apply(np.array([pose.state.T_world_body.t for pose in poses]))
     points = np.array([fix.position for fix in fixes])
     print(f"The reference's clock is {late_s:.2f} s ahead by its velocity.\n")
     print("| car | horizontal RMSE, stamps as they are | most | stamps corrected | most |\n|---|---|---|---|---|")
