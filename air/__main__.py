@@ -61,10 +61,11 @@ def _parser() -> argparse.ArgumentParser:
     position.add_argument("--systems", default="GREJC", metavar="GREJC", help="GNSS to use, letters as in RINEX")
     position.add_argument("--mask", type=float, default=10.0, metavar="DEG", help="least elevation of a satellite")
     position.add_argument("--dual", action="store_true", help="remove the ionosphere by a second band")
+    position.add_argument("--smooth", action="store_true", help="join the positions by carrier phase, looking back")
     position.set_defaults(run=_position)
 
-    odometry = commands.add_parser("odometry", help="trajectory of a flight with a camera and an IMU, as files")
-    odometry.add_argument("source", metavar="SOURCE", help="with frames and IMU samples, e.g. euroc:DIR or F.mcap")
+    odometry = commands.add_parser("odometry", help="trajectory by IMU, camera and GNSS, as files")
+    odometry.add_argument("source", metavar="SOURCE", help="with IMU samples and frames or raw GNSS: F.mcap, euroc:DIR")
     odometry.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     odometry.add_argument("--calibration", type=Path, metavar="F", help="of the camera, where the source has none")
     odometry.set_defaults(run=_odometry)
@@ -103,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
 
     for command in (process, info, position, odometry, replay, simulate, convert):
         command.add_argument("--quiet", action="store_true", help="no progress bar")
-    for command in (check, process, run, record, replay, simulate):
+    for command in (check, process, odometry, run, record, replay, simulate):
         command.add_argument("--config", type=Path, metavar="FILE", help="TOML file; without it the defaults hold")
     return parser
 
@@ -158,13 +159,14 @@ def _position(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from air.gnss.settings import PositioningSettings
-    from air.positions import find_positions, in_words, write_positions
+    from air.positions import find_positions, find_smooth_positions, in_words, write_positions
     from air.sources.source import open_source
 
     settings = PositioningSettings(args.systems, args.mask, ionosphere_free=args.dual)
     source = open_source(args.source)
     passing = tqdm(source, unit=" items", leave=False, disable=True if args.quiet else None)
-    for line in in_words(write_positions(args.out, find_positions(passing, settings))):
+    find = find_smooth_positions if args.smooth else find_positions
+    for line in in_words(write_positions(args.out, find(passing, settings))):
         print(line)
     for problem in source.problems:
         print(f"{problem.name}: {problem.text}", file=sys.stderr)
@@ -172,10 +174,11 @@ def _position(args: argparse.Namespace) -> int:
 
 
 def _odometry(args: argparse.Namespace) -> int:
-    from air.odometry.settings import OdometrySettings
+    from air.config import AirConfig
     from air.trajectory import find_trajectory, in_words
 
-    report = find_trajectory(args.source, args.out, args.calibration, OdometrySettings(), args.quiet)
+    settings = load(args.config, AirConfig).odometry
+    report = find_trajectory(args.source, args.out, args.calibration, settings, args.quiet)
     for problem in report.problems:
         print(f"{problem['name']}: {problem['text']}", file=sys.stderr)
     for line in in_words(report):

@@ -10,6 +10,7 @@ from typing import Annotated
 from air.alignment.settings import AlignmentSettings
 from air.devices.settings import DevicesConfig
 from air.mapping.settings import MappingSettings
+from air.odometry.settings import OdometrySettings
 from common.bus import BusConfig
 from common.config import Range
 from common.errors import ConfigError
@@ -67,10 +68,13 @@ class AirConfig:
     uplink: UplinkConfig = field(default_factory=UplinkConfig)
     devices: DevicesConfig = field(default_factory=DevicesConfig)
     recorder: RecorderConfig = field(default_factory=RecorderConfig)
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a name that makes no key."""
+        """Raises ConfigError for a name that makes no key, and for a lever arm that is none."""
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", self.vehicle):
             raise ConfigError(f"vehicle is {self.vehicle!r}; allowed: 1 to 32 letters, digits, - and _")
+        if len(lever_arm := self.odometry.gnss.p_body_antenna) != 3:
+            raise ConfigError(f"odometry.gnss.p_body_antenna is {list(lever_arm)}; allowed: three numbers, m")

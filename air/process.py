@@ -1,4 +1,4 @@
-"""A flight in one go: source → alignment → final adjustment → map → files. No bus, no clock in the result."""
+"""A flight in one go: source → odometry → alignment → adjustment → map → files. No bus, no clock in the result."""
 
 from __future__ import annotations
 
@@ -12,14 +12,19 @@ from tqdm import tqdm
 from air.alignment.alignment import Alignment
 from air.config import AirConfig
 from air.mapping.mapper import Mapper
+from air.odometry_report import Told
 from air.preparation import prepared
 from air.report import Report, Stopwatch, counts, known_cells, peak_memory, problems_of
-from air.sources.source import PhotoSource, open_photos
+from air.sources.navigated import Navigated
+from air.sources.source import PhotoSource, Source, open_photos
 from common.errors import ExportError, SourceError
 from common.export.products import write_products
+from common.export.trajectory import write_tum
+from common.geo import T_world_other
 from common.messages import Datum, Keyframe, MapTile
 
 CHUNK = 10
+ODOMETRY = "odometry.tum"
 
 
 def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Report:
@@ -28,8 +33,12 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
     Raises SourceError when the source cannot be opened or none of its photos could be placed, and ExportError when
     the folder cannot be written to, before any work is done.
     """
-    watch = Stopwatch()
-    source = open_photos(url)
+    watch, told = Stopwatch(), Told()
+
+    def photos_of(source: Source) -> Navigated:
+        return Navigated(source, config.odometry, tell=told.add, stage=watch.stage)
+
+    source = open_photos(url, photos_of=photos_of)
     _make_folder(out)
     alignment = Alignment("offline", config.alignment)
     mapper = Mapper(replace(config.mapping, revisable=False))
@@ -46,7 +55,8 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
         tiles = _map(keyframes, mapper, alignment, quiet)
     with watch.stage("export"):
         _write(out, source, alignment.datum, tiles, keyframes)
-    report = _report(source, alignment, tiles, config, watch)
+        _write_odometry(out, told, alignment.datum)
+    report = _report(source, alignment, tiles, told, config, watch)
     report.write(out / "report.json")
     return report
 
@@ -84,15 +94,23 @@ def _write(out: Path, source: PhotoSource, datum: Datum, tiles: list[MapTile], k
         source.truth.write(out / "truth")
 
 
+def _write_odometry(out: Path, told: Told, datum: Datum) -> None:
+    """Write the odometry's own trajectory of the body, in the world of the map."""
+    if told.datum is not None and told.poses:
+        T = T_world_other(datum, told.datum)
+        write_tum(out / ODOMETRY, [p.t_ns for p in told.poses], [T @ p.T_world_body for p in told.poses])
+
+
 def _why(alignment: Alignment, source: PhotoSource) -> str:
     problems = problems_of(alignment.statuses(), source.problems)
     return "; ".join(f"{p['photo']}: {p['reason']}" for p in problems[:3]) + ("; …" if len(problems) > 3 else "")
 
 
 def _report(
-    source: PhotoSource, alignment: Alignment, tiles: list[MapTile], config: AirConfig, watch: Stopwatch
+    source: PhotoSource, alignment: Alignment, tiles: list[MapTile], told: Told, config: AirConfig, watch: Stopwatch
 ) -> Report:
     cells = known_cells(tiles)
+    odometry = source.navigator.odometry if isinstance(source, Navigated) and source.navigator else None
     return Report(
         source=source.url,
         photos=counts(alignment.statuses()),
@@ -101,6 +119,7 @@ def _report(
         reprojection_rms_px=alignment.residual_px(),
         tiles=len(tiles),
         cells=cells,
+        odometry=None if odometry is None else told.report(odometry),
         area_m2=cells * config.mapping.cell**2,
         stages_s={name: round(s, 3) for name, s in watch.stages.items()},
         wall_s=round(watch.total, 3),

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from air.alignment.status import PhotoStatus, State
+from air.odometry_report import OdometryReport
 from air.sources.source import Problem
 from common.camera import CameraModel
 from common.messages import MapTile
@@ -42,13 +43,17 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Report:
-    """What `report.json` says; times in s, memory in bytes, lengths in px and m as named."""
+    """What `report.json` says; times in s, memory in bytes, lengths in px and m as named.
+
+    `odometry` is None for a source of photos.
+    """
 
     source: str
     photos: dict[str, int]
     problems: list[dict[str, str]]
     cameras: list[CameraModel]
     reprojection_rms_px: float
+    odometry: OdometryReport | None
     tiles: int
     cells: int
     area_m2: float

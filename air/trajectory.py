@@ -3,108 +3,76 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
-from air.odometry.odometry import Odometry, Output
+from air.navigation import mounted, with_lever_arm
+from air.odometry.odometry import Odometry
 from air.odometry.settings import OdometrySettings
+from air.odometry_report import OdometryReport, Told
 from air.report import Stopwatch, peak_memory
-from air.sensors.calibration import Calibration, read_calibration
+from air.sensors.calibration import read_calibration
+from air.sources.known import known_of
 from air.sources.source import Source, open_source
 from common.errors import CalibrationError, ExportError
+from common.export.datum import write_datum
 from common.export.trajectory import write_tum
-from common.measurements import CameraFrame
-from common.messages import Datum, EstimatorState, Keyframe, Pose
+from common.measurements import CameraFrame, GnssEpoch
+from common.messages import Keyframe, Pose
 
 
 @dataclass(frozen=True)
 class TrajectoryReport:
-    """What `report.json` says: times in s since the first frame, lengths in m, px.
-
-    `modes` are the times at which the mode changed; `notes` what happened when.
-    """
+    """What `report.json` says; `camera` is "" where there is none. Times in s, memory in bytes."""
 
     source: str
     camera: str
     frames: int
-    refused_frames: int
-    refused_samples: int
-    poses: int
-    keyframes: int
-    first_pose_s: float | None
-    travelled_m: float
-    modes: list[tuple[float, str]]
-    notes: list[tuple[float, str]]
-    reprojection_rms_px: float
+    odometry: OdometryReport
     problems: list[dict[str, str]]
     wall_s: float
     stages_s: dict[str, float]
     peak_memory_bytes: int
 
 
-@dataclass(eq=False)
-class _Told:
-    """What the odometry has told so far."""
-
-    poses: list[Pose] = field(default_factory=list)
-    keyframes: list[Keyframe] = field(default_factory=list)
-    states: list[EstimatorState] = field(default_factory=list)
-    datum: Datum | None = None
-
-    def add(self, outputs: list[Output]) -> None:
-        for message in outputs:
-            if isinstance(message, Pose):
-                self.poses.append(message)
-            elif isinstance(message, Keyframe):
-                self.keyframes.append(message)
-            elif isinstance(message, Datum):
-                self.datum = message
-            else:
-                self.states.append(message)
-
-
 def find_trajectory(
     url: str, out: Path, calibration: Path | None, settings: OdometrySettings, quiet: bool
 ) -> TrajectoryReport:
-    """The report of a source's trajectory, after `trajectory.tum` (body, at the rate of the IMU), `keyframes.tum`
-    (camera) and `report.json` have been written into `out`.
+    """The report of a source's trajectory, after files have been written into `out`.
+
+    These are `trajectory.tum` (body, at the rate of the IMU), `keyframes.tum` (camera), `report.json`, and where GNSS
+    has told where the world lies, `datum.json`. A source without frames is found by GNSS and IMU.
 
     Raises SourceError, CalibrationError where the camera is not known, and ExportError where nothing can be written.
     """
-    source, watch = open_source(url), Stopwatch()
-    known = None if calibration is None else read_calibration(calibration)
-    odometry, camera, told, frames, first_ns = None, "", _Told(), 0, 0
+    source, watch, told = open_source(url), Stopwatch(), Told()
+    known = known_of(source)
+    given = None if calibration is None else ("", read_calibration(calibration))
+    camera, mounting = given or mounted(known) or ("", None)
+    odometry = Odometry(mounting, "flight", with_lever_arm(settings, known), known.p_base_ecef, watch.stage)
+    frames, epochs = 0, 0
     for message in tqdm(source, unit=" items", leave=False, disable=True if quiet else None):
         if isinstance(message, CameraFrame):
-            if odometry is None:
-                camera, first_ns = message.camera, message.t_ns
-                odometry = Odometry(known or calibration_of(source, camera), "flight", settings)
+            if mounting is None:
+                raise _unknown(source, message.camera)
+            camera = camera or message.camera
             if message.camera != camera:
                 continue
             frames += 1
-        if odometry is not None:
-            with watch.stage("frames" if isinstance(message, CameraFrame) else "imu"):
-                told.add(odometry.feed(message))
-    if odometry is None:
-        raise CalibrationError(f"source {url!r}: holds no camera frames; the odometry needs frames and IMU samples")
+        epochs += isinstance(message, GnssEpoch)
+        in_world = odometry.in_world
+        for said in odometry.feed(message):
+            if told.datum is None or in_world or not isinstance(said, Pose | Keyframe):
+                told.add(said)
+    if not frames and not epochs:
+        raise CalibrationError(f"source {url!r}: holds no camera frames and no GNSS epochs; the odometry needs either")
     report = TrajectoryReport(
         source=url,
-        camera=camera,
+        camera=camera if frames else "",
         frames=frames,
-        refused_frames=odometry.refused_frames,
-        refused_samples=odometry.estimator.buffer.refused,
-        poses=len(told.poses),
-        keyframes=len(told.keyframes),
-        first_pose_s=_since(told.poses[0].t_ns, first_ns) if told.poses else None,
-        travelled_m=_length(told.keyframes),
-        modes=_changes(told.poses, first_ns),
-        notes=[(_since(t_ns, first_ns), text) for t_ns, text in odometry.notes],
-        reprojection_rms_px=_rms([state.reprojection_rms_px for state in told.states]),
+        odometry=told.report(odometry),
         problems=[asdict(problem) for problem in source.problems],
         wall_s=watch.total,
         stages_s=watch.stages,
@@ -114,29 +82,25 @@ def find_trajectory(
     return report
 
 
-def calibration_of(source: Source, camera: str) -> Calibration:
-    """The calibration that comes with a source. Raises CalibrationError where there is none, or no mounting."""
-    known = getattr(source, "known", None)
-    calibrations: Mapping[str, Calibration] = (
-        known.cameras if known is not None else getattr(source, "calibrations", {})
-    )
-    if camera not in calibrations:
-        raise CalibrationError(
+def _unknown(source: Source, camera: str) -> CalibrationError:
+    """What is missing about a camera."""
+    if camera not in known_of(source).cameras:
+        return CalibrationError(
             f"source {source.url!r}: camera {camera!r} has no calibration; name one: --calibration F"
         )
-    if calibrations[camera].T_body_cam is None:
-        raise CalibrationError(
-            f"source {source.url!r}: the calibration of {camera!r} lacks T_body_cam; "
-            "find it with luojia-air calibrate imu-camera and name it: --calibration F"
-        )
-    return calibrations[camera]
+    return CalibrationError(
+        f"source {source.url!r}: the calibration of {camera!r} lacks T_body_cam; "
+        "find it with luojia-air calibrate imu-camera and name it: --calibration F"
+    )
 
 
-def _write(out: Path, told: _Told, report: TrajectoryReport) -> None:
+def _write(out: Path, told: Told, report: TrajectoryReport) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_tum(out / "trajectory.tum", [p.t_ns for p in told.poses], [p.T_world_body for p in told.poses])
         write_tum(out / "keyframes.tum", [k.t_ns for k in told.keyframes], [k.T_world_cam for k in told.keyframes])
+        if told.datum is not None:
+            write_datum(out / "datum.json", told.datum)
         (out / "report.json").write_text(json.dumps(asdict(report), indent=2) + "\n")
     except OSError as error:
         raise ExportError(f"{str(out)!r} cannot be written: {error.strerror}") from error
@@ -144,34 +108,13 @@ def _write(out: Path, told: _Told, report: TrajectoryReport) -> None:
 
 def in_words(report: TrajectoryReport) -> list[str]:
     """Lines that sum a report up."""
-    if report.first_pose_s is None:
-        return [f"{report.frames} frames of {report.camera}, and no pose: the odometry could not begin"]
+    told = report.odometry
+    seen = f"{report.frames} frames of {report.camera}" if report.frames else "GNSS and IMU"
+    if told.first_pose_s is None:
+        return [f"{seen}, and no pose: the odometry could not begin"]
+    between = f", {told.reprojection_rms_px:.2f} px between points and images" if report.frames else ""
     return [
-        f"{report.keyframes} keyframes and {report.poses} poses of {report.frames} frames in {report.wall_s:.1f} s",
-        f"first pose after {report.first_pose_s:.1f} s, {report.travelled_m:.1f} m travelled, "
-        f"{report.reprojection_rms_px:.2f} px between points and images",
-        *(f"{t_s:8.1f} s  {text}" for t_s, text in sorted([*report.modes, *report.notes])),
+        f"{told.keyframes} keyframes and {told.poses} poses of {seen} in {report.wall_s:.1f} s",
+        f"first pose after {told.first_pose_s:.1f} s, {told.travelled_m:.1f} m travelled{between}",
+        *(f"{t_s:8.1f} s  {text}" for t_s, text in sorted([*told.modes, *told.notes])),
     ]
-
-
-def _since(t_ns: int, first_ns: int) -> float:
-    return round((t_ns - first_ns) * 1e-9, 3)
-
-
-def _changes(poses: list[Pose], first_ns: int) -> list[tuple[float, str]]:
-    """When the mode changed, and to which."""
-    changes: list[tuple[float, str]] = []
-    for pose in poses:
-        if not changes or changes[-1][1] != str(pose.mode):
-            changes.append((_since(pose.t_ns, first_ns), str(pose.mode)))
-    return changes
-
-
-def _length(keyframes: list[Keyframe]) -> float:
-    p = np.array([k.T_world_cam.t for k in keyframes]).reshape(-1, 3)
-    return float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum())
-
-
-def _rms(values: list[float]) -> float:
-    finite: Any = [value for value in values if np.isfinite(value) and value > 0]
-    return float(np.sqrt(np.mean(np.square(finite)))) if finite else 0.0

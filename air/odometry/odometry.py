@@ -1,8 +1,10 @@
-"""Camera frames and IMU samples in, poses and keyframes out: the odometry of one flight."""
+"""Camera frames, IMU samples and GNSS epochs in, poses and keyframes out: the odometry of one flight."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import cv2
 import numpy as np
@@ -15,11 +17,15 @@ from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import Tracker
 from air.sensors.calibration import Calibration
 from common.arrays import F64, U8
+from common.camera import CameraModel
 from common.gravity import normal_gravity
 from common.measurements import CameraFrame, Encoding, FixKind, GnssEpoch, ImuSample, Measurement, ReceiverSolution
 from common.messages import Datum, EstimatorState, Keyframe, Mode, Photo, Pose
+from common.se3 import SE3
 
 Output = Pose | Keyframe | EstimatorState | Datum
+Stage = Callable[[str], AbstractContextManager[None]]
+"""What is entered for each of the named parts of the work."""
 BASE = "base"
 """Name of the base station's receiver."""
 WAITING = 60
@@ -30,25 +36,39 @@ EVERY_NS = 1_000_000_000
 """Between two `EstimatorState`."""
 
 
+def unwatched(_: str) -> AbstractContextManager[None]:
+    """A stage that nobody watches."""
+    return nullcontext()
+
+
 class Odometry:
     """Feed it measurements in the order in which they came; it answers with what they tell.
 
-    One camera is followed, whose calibration it is given. `world` is level; its origin and heading are those of the
-    first pose until GNSS has told where it lies: from then on it is east, north, up at the `Datum` that is told.
+    One camera is followed, whose calibration it is given; without one, GNSS and IMU alone tell the motion, and frames
+    are refused. `world` is level; its origin and heading are those of the first pose until GNSS has told where it lies:
+    from then on it is east, north, up at the `Datum` that is told.
     """
 
     def __init__(
-        self, calibration: Calibration, flight: str, settings: OdometrySettings | None = None, base: F64 | None = None
+        self,
+        calibration: Calibration | None,
+        flight: str,
+        settings: OdometrySettings | None = None,
+        base: F64 | None = None,
+        stage: Stage = unwatched,
     ) -> None:
-        """`base` (3,) m, ECEF, is where a base station stands. Raises ValueError for a calibration that does not say
-        where the camera sits on the body."""
-        if calibration.T_body_cam is None:
+        """`base` (3,) m, ECEF, is where a base station stands; `stage` watches the parts of the work. Raises ValueError
+        for a calibration that does not say where the camera sits on the body."""
+        T_body_cam = SE3.identity() if calibration is None else calibration.T_body_cam
+        if T_body_cam is None:
             raise ValueError("the calibration lacks T_body_cam")
         self._settings = settings or OdometrySettings()
-        self._calibration, self._flight = calibration, flight
-        self._camera, self._T_body_cam = calibration.camera, calibration.T_body_cam
-        self.tracker = Tracker(self._camera, self._settings.tracker)
-        self.estimator = Estimator(self._camera.fx, self._T_body_cam, self._settings, flight, base)
+        self._calibration, self._flight, self._stage = calibration, flight, stage
+        self._time_offset_s = 0.0 if calibration is None else calibration.time_offset_s
+        self._T_body_cam = T_body_cam
+        self._tracker = None if calibration is None else Tracker(calibration.camera, self._settings.tracker)
+        focal = 1.0 if calibration is None else calibration.camera.fx
+        self.estimator = Estimator(focal, T_body_cam, self._settings, flight, base)
         self._datum: Datum | None = None
         self._waiting: deque[tuple[int, CameraFrame]] = deque(maxlen=WAITING)
         self._tracked_ns: int | None = None
@@ -57,17 +77,21 @@ class Odometry:
         self._keyframes = 0
         self._mode = Mode.INITIALIZING
         self._sigma = np.zeros(3)
+        self.first_ns: int | None = None
+        """Of the first frame or IMU sample."""
         self.refused_frames = 0
         self.notes: list[tuple[int, str]] = []
         """What happened when, ns."""
 
     def feed(self, message: Measurement | Photo) -> list[Output]:
         """A pose for each IMU sample once it has begun; keyframes, and the estimator's state every second."""
+        if self.first_ns is None and isinstance(message, CameraFrame | ImuSample):
+            self.first_ns = message.t_ns
         if isinstance(message, CameraFrame):
-            self._waiting.append((message.t_ns + round(self._calibration.time_offset_s * 1e9), message))
-            return self._frames()
+            return self._receive(message)
         if isinstance(message, ImuSample):
-            state = self.estimator.add_imu(message)
+            with self._stage("imu"):
+                state = self.estimator.add_imu(message)
             poses: list[Output] = [] if state is None else [self._pose(state)]
             return poses + self._frames() + self._epochs()
         if isinstance(message, ReceiverSolution):
@@ -78,6 +102,18 @@ class Odometry:
         else:
             self.estimator.gnss.add(message)
         return []
+
+    @property
+    def in_world(self) -> bool:
+        """Whether poses are in the world of the datum now; after a window was lost they may not be, for a while."""
+        return self.estimator.window is not None and self.estimator.window.companion is not None
+
+    def _receive(self, frame: CameraFrame) -> list[Output]:
+        if self._tracker is None:
+            self.refused_frames += 1
+            return []
+        self._waiting.append((frame.t_ns + round(self._time_offset_s * 1e9), frame))
+        return self._frames()
 
     def _learn(self, solution: ReceiverSolution) -> None:
         """What a receiver's own solution says about gravity and the speed: of use until it has begun."""
@@ -99,25 +135,32 @@ class Odometry:
 
     def _epochs(self) -> list[Output]:
         """What the waiting GNSS epochs tell that IMU samples cover by now."""
-        return [output for estimate in self.estimator.take_epochs() for output in self._tell(estimate)]
+        with self._stage("gnss"):
+            estimates = self.estimator.take_epochs()
+        return [output for estimate in estimates for output in self._tell(estimate)]
 
     def _frame(self, t_ns: int, frame: CameraFrame) -> list[Output]:
-        image = decoded(frame)
-        if image is None or image.shape[:2] != (self._camera.height, self._camera.width):
-            self.refused_frames += 1
-            return []
-        if self._tracked_ns is not None and t_ns <= self._tracked_ns:
-            self.refused_frames += 1
-            return []
-        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        line_time_s = frame.line_time_s or self._calibration.line_time_s
-        tracked = self.tracker.track(np.asarray(gray, np.uint8), t_ns, self._turn(t_ns), line_time_s)
+        assert self._calibration is not None
+        assert self._tracker is not None
+        camera = self._calibration.camera
+        with self._stage("tracker"):
+            image = decoded(frame)
+            if image is None or image.shape[:2] != (camera.height, camera.width):
+                self.refused_frames += 1
+                return []
+            if self._tracked_ns is not None and t_ns <= self._tracked_ns:
+                self.refused_frames += 1
+                return []
+            gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            line_time_s = frame.line_time_s or self._calibration.line_time_s
+            tracked = self._tracker.track(np.asarray(gray, np.uint8), t_ns, self._turn(t_ns), line_time_s)
         self._tracked_ns = t_ns
         if t_ns - self._solved_ns < 0.9e9 / self._settings.rate_hz:
             return []
         self._solved_ns = t_ns
         self._images.append((t_ns, image))
-        outcome = self.estimator.add_frame(tracked)
+        with self._stage("window"):
+            outcome = self.estimator.add_frame(tracked)
         if isinstance(outcome, Refusal):
             self._mode = Mode.INITIALIZING
             return []
@@ -142,8 +185,8 @@ class Odometry:
         if (datum := self.estimator.gnss.datum) is not None and datum is not self._datum:
             self._datum = datum
             out.append(datum)
-        if estimate.keyframe is not None:
-            out.append(self._keyframe(estimate.keyframe))
+        if estimate.keyframe is not None and self._calibration is not None:
+            out.append(self._keyframe(estimate.keyframe, self._calibration.camera))
         if estimate.state.t_ns - self._told_ns >= EVERY_NS:
             self._told_ns = estimate.state.t_ns
             out.append(self._state(estimate))
@@ -160,7 +203,7 @@ class Odometry:
             mode=self._mode,
         )
 
-    def _keyframe(self, state: InertialState) -> Keyframe:
+    def _keyframe(self, state: InertialState, camera: CameraModel) -> Keyframe:
         index, self._keyframes = self._keyframes, self._keyframes + 1
         images = [image for t_ns, image in self._images if t_ns == state.t_ns]
         return Keyframe(
@@ -170,7 +213,7 @@ class Odometry:
             t_ns=state.t_ns,
             name=f"frame-{state.t_ns}",
             T_world_cam=state.T_world_body @ self._T_body_cam,
-            camera=self._camera,
+            camera=camera,
             sigma=self._sigma,
             thumbnail=thumbnail(_rgb(images[0])) if images else b"",
         )
@@ -185,7 +228,7 @@ class Odometry:
             accel_bias=state.accel_bias,
             gyro_bias=state.gyro_bias,
             T_body_cam=self._T_body_cam,
-            time_offset_s=self._calibration.time_offset_s,
+            time_offset_s=self._time_offset_s,
             points=estimate.solution.points,
             satellites=self.estimator.gnss.satellites(state.t_ns),
             reprojection_rms_px=estimate.solution.rms_px,

@@ -78,3 +78,9 @@ def read_known(folder: Path) -> Known:
         places[name] = None if place is None else np.array(place)
     cameras = {p.stem: read_calibration(p) for p in sorted(folder.glob("*.toml")) if p != path}
     return Known(cameras, places["p_body_antenna"], places["p_base_ecef"], vars(told.delay_s))
+
+
+def known_of(source: object) -> Known:
+    """What is known with a source: told by it or by the folder beside it, or the calibrations that its files hold."""
+    known: Known | None = getattr(source, "known", None)
+    return Known(getattr(source, "calibrations", {})) if known is None else known

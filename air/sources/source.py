@@ -76,34 +76,38 @@ def open_source(url: str) -> Source:
     return _OPENERS[scheme](url, rest)
 
 
+def _navigated(source: Source) -> PhotoSource:
+    # Imported when needed, as are the readers of formats below.
+    from air.odometry.settings import OdometrySettings
+    from air.sources.navigated import Navigated
+
+    return Navigated(source, OdometrySettings())
+
+
 def open_photos(
     url: str,
     pace: float | None = None,
     *,
+    photos_of: Callable[[Source], PhotoSource] = _navigated,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> PhotoSource:
     """The photos that a URL names, e.g. `photos:flights/monday` or `sim:survey?seed=1&photos=60`.
 
-    Of a source of camera frames and positions they are frames far enough apart. `pace` None gives photos as fast as
+    Of a source of camera frames `photos_of` makes them: by default frames far enough apart, at the positions that
+    the odometry or the receiver tells. `pace` None gives photos as fast as
     they can be read, 1.0 at the pace of their time stamps, 2.0 twice as fast.
     `clock` (monotonic, s) and `sleep` (s) serve the pace. Raises SourceError, in one line, like `open_source`.
     """
     if pace is not None and not 0.0 < pace < float("inf"):
         raise SourceError(f"source {url!r}: pace is {pace}, must be a positive number (1 = as flown)")
     source = open_source(url)
-    photos = cast(PhotoSource, source) if isinstance(source, Sized) else _stills_of(source)
+    photos = cast(PhotoSource, source) if isinstance(source, Sized) else photos_of(source)
     if pace is None:
         return photos
     from air.sources.pace import Paced
 
     return Paced(photos, pace, clock, sleep)
-
-
-def _stills_of(source: Source) -> PhotoSource:
-    from air.sources.stills import stills_of
-
-    return stills_of(source)
 
 
 def _open_photos(url: str, rest: str) -> Source:
