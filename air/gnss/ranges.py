@@ -109,6 +109,11 @@ def group_delay(ephemeris: Ephemeris, signal: str, f: float) -> float:
     return LIGHT * late.get(band, own)
 
 
+def tells_group_delay(ephemeris: Ephemeris) -> bool:
+    """Whether an ephemeris says by how much signals are late: GLONASS's and those fitted to precise orbits do not."""
+    return isinstance(ephemeris, KeplerEphemeris) and ephemeris.source != "SP3"
+
+
 def _by_satellite(epoch: GnssEpoch) -> Iterable[tuple[str, list[int]]]:
     order = sorted(range(len(epoch.satellites)), key=epoch.satellites.__getitem__)
     return [(satellite, list(rows)) for satellite, rows in groupby(order, key=epoch.satellites.__getitem__)]

@@ -14,7 +14,7 @@ from air.gnss.atmosphere import L1_HZ, TYPICAL, klobuchar, saastamoinen
 from air.gnss.ephemerides import Ephemerides, is_healthy
 from air.gnss.orbit import geometric_range, states_at_transmission
 from air.gnss.positioning import azimuth_elevation
-from air.gnss.ranges import CLOCKS, FURTHEST, NEAREST, group_delay
+from air.gnss.ranges import CLOCKS, FURTHEST, NEAREST, group_delay, tells_group_delay
 from air.gnss.signals import LIGHT, PRIMARY, SECONDARY, frequency, preference
 from common.arrays import F64, I64, Bool
 from common.geo import ecef_to_geodetic
@@ -32,7 +32,8 @@ class Signals:
     `row` (M,) is that of the epoch, `first` (M,) whether it is the first band. `p_satellite`, `v_satellite` (M, 3) are
     in ECEF at transmission, as the frame stood then. `code`, `carrier` (M,) m and `rate` (M,) m/s are free of the
     models; `carrier` is NaN where none is tracked, `rate` where there is no Doppler. `bend` (M,) is by how much the
-    ionosphere delays more than at L1; `slant` (M,) by how much more than in the zenith; `elevation` (M,) rad.
+    ionosphere delays more than at L1; `slant` (M,) by how much more than in the zenith; `elevation` (M,) rad; `told`
+    (M,) whether the satellite says by how much its signal is late.
     """
 
     row: I64
@@ -48,6 +49,7 @@ class Signals:
     bend: F64
     slant: F64
     elevation: F64
+    told: Bool
 
     def ranges(self, p_ecef: F64) -> F64:
         """Distances (M,) m that the signals travel to a place (3,) m, the turn of the earth included."""
@@ -99,6 +101,7 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
         bend=bend[index],
         slant=(1.0 + 16.0 * (0.53 - angle / np.pi) ** 3)[index],
         elevation=elevation[index],
+        told=np.array([tells_group_delay(one) for one in ephemerides], bool)[index],
     )
 
 

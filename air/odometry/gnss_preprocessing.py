@@ -25,7 +25,8 @@ from common.measurements import GnssEpoch
 _LOW = np.radians(20.0)
 _NOMINAL_CN0 = 45.0
 _GLONASS = 1.5
-_MIN_GLONASS_ORBIT = 3.0
+_UNTOLD = 3.0
+"""Least sigma of a satellite's clock, m, where nobody tells by how much its signals are late."""
 _LEAST = 0.7
 _MIN_DIFFERENCES = 5
 
@@ -158,7 +159,7 @@ class GnssPreprocessor:
         elevation = signals.elevation[first]
         systems = tuple(signals.clocks[i] + ("-base" if measured.differential else "") for i in first)
         glonass = np.array([name[0] == "R" for name in systems], bool)
-        orbit = np.where(glonass, max(noise.orbit, _MIN_GLONASS_ORBIT), noise.orbit)
+        orbit = np.where(signals.told[first], noise.orbit, max(noise.orbit, _UNTOLD))
         air = np.hypot(noise.ionosphere * bend * signals.slant[first], noise.troposphere / np.sin(elevation))
         left = noise.differential if measured.differential else 1.0
         return CleanEpoch(
