@@ -13,6 +13,7 @@ from air.gnss.calendar import to_calendar
 from air.gnss.ephemerides import Ephemerides
 from air.gnss.positioning import PointPosition, Refused, find_position
 from air.gnss.settings import PositioningSettings
+from air.odometry.carrier_smoothing import CarrierSmoother
 from air.sources.source import Sensed
 from common.arrays import F64
 from common.errors import ExportError
@@ -29,9 +30,11 @@ COLUMNS = (
 Outcome = PointPosition | Refused
 
 
-def find_positions(items: Iterable[Sensed], settings: PositioningSettings) -> Iterator[tuple[GnssEpoch, Outcome]]:
-    """Each epoch with its position, from what was broadcast until then."""
-    broadcast = Ephemerides()
+def find_positions(
+    items: Iterable[Sensed], settings: PositioningSettings, broadcast: Ephemerides | None = None
+) -> Iterator[tuple[GnssEpoch, Outcome]]:
+    """Each epoch with its position, from what was broadcast until then, which `broadcast` keeps."""
+    broadcast = Ephemerides() if broadcast is None else broadcast
     last: dict[str, F64] = {}
     for item in items:
         broadcast.add(item)
@@ -40,6 +43,23 @@ def find_positions(items: Iterable[Sensed], settings: PositioningSettings) -> It
             if isinstance(outcome, PointPosition):
                 last[item.receiver] = outcome.position
             yield item, outcome
+
+
+def find_smooth_positions(
+    items: Iterable[Sensed], settings: PositioningSettings
+) -> Iterator[tuple[GnssEpoch, Outcome]]:
+    """Each epoch with its position, joined to the others by carrier phase; all at the end, for each tells of all."""
+    broadcast = Ephemerides()
+    smoothers: dict[str, CarrierSmoother] = {}
+    single = []
+    for epoch, outcome in find_positions(items, settings, broadcast):
+        single.append((epoch, outcome))
+        if isinstance(outcome, PointPosition):
+            smoother = smoothers.setdefault(epoch.receiver, CarrierSmoother(broadcast, settings))
+            smoother.add(epoch, outcome)
+    smooth = {receiver: iter(smoother.smoothed()) for receiver, smoother in smoothers.items()}
+    for epoch, outcome in single:
+        yield epoch, next(smooth[epoch.receiver]) if isinstance(outcome, PointPosition) else outcome
 
 
 def write_positions(path: Path, outcomes: Iterable[tuple[GnssEpoch, Outcome]]) -> list[Outcome]:
