@@ -62,6 +62,15 @@ def adjust(
     return Adjusted(values, covariance, done)
 
 
+def covariance_of(
+    key: int, graph: gtsam.NonlinearFactorGraph, known: Sequence[Quadratic], values: gtsam.Values, unknowns: Unknowns
+) -> F64:
+    """Covariance (D, D) of one variable that is no point. Raises as `adjust` does."""
+    rest = graph.linearize(values).eliminatePartialSequential(gtsam.Ordering(list(unknowns.points)))[1]
+    chain = [other for other in unknowns.chain if other != key]
+    return equations_of(rest, known, values).solve([key], chain)[1]
+
+
 def equations_of(rest: gtsam.GaussianFactorGraph, known: Sequence[Quadratic], values: gtsam.Values) -> NormalEquations:
     """The sum of gtsam's linear factors and of what else is known, at the same values."""
     mine = rest.keyVector()

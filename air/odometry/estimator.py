@@ -32,6 +32,8 @@ JOINED = np.diag([1e-3, 1e-3, 1e-3, 1e-4]) ** 2
 """Of where what began anew is placed: the world is where that is."""
 HALF_GYRO_NS = 10_000_000
 RETRY_S = 5.0
+JUMP = 0.1
+"""By so many metres the world may move without being told."""
 SILENT_S = 1.0
 """Without a frame for so long, an epoch stands in for one that shows nothing."""
 
@@ -149,6 +151,17 @@ class Estimator:
         self._propagate_from(window.state())
         return self._estimate(window, solution, note="the world has been found by GNSS")
 
+    def _fix(self, window: Window) -> str:
+        """What is to be told when whole cycles of carriers have moved the world."""
+        before = window.state().T_world_body.t
+        if not self.gnss.fix(window) or window.solve().failed:
+            return ""
+        jump = float(np.linalg.norm(window.state().T_world_body.t - before))
+        if jump < JUMP:
+            return ""
+        self.revision += 1
+        return f"carriers of whole cycles move the world by {jump:.2f} m"
+
     def _begin_without_frames(self, epoch: CleanEpoch) -> Estimate | None:
         if epoch.t_ns - self._frame_ns < SILENT_S * 1e9:
             return None
@@ -238,9 +251,10 @@ class Estimator:
         solution = window.solve()
         if why := self._astray(window, solution, predicted):
             return self._repair(window, frame, predicted, why)
+        note = self._fix(window)
         keyframe = window.state(-2) if window.slide() else None
         self._propagate_from(window.state())
-        return self._estimate(window, solution, keyframe, still)
+        return self._estimate(window, solution, keyframe, still, note)
 
     def _estimate(
         self,

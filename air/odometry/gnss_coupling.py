@@ -22,6 +22,8 @@ from common.messages import Datum
 WAITING = 50
 """Epochs that wait for the IMU; older ones are given up."""
 GYRO_NS = 20_000_000
+SIGMA_CYCLES = 0.05
+"""Below it carriers of whole cycles place the aircraft, m; codes add nothing."""
 
 
 class GnssCoupling:
@@ -95,6 +97,10 @@ class GnssCoupling:
             self._add(window, passed)
         return True
 
+    def fix(self, window: Window) -> bool:
+        """Whether the place has just become known to whole cycles of a base station's carriers."""
+        return self._companion is not None and self._companion.fix(window)
+
     def join(self, window: Window, datum: Datum) -> None:
         """Be the companion of a window whose world is ENU at a datum."""
         self.datum, self.why_not = datum, ""
@@ -117,7 +123,9 @@ class GnssCoupling:
     def _is_anchored(self, window: Window) -> bool:
         """Whether pseudoranges have done their work and the position is still as well known."""
         sigma = float(np.sqrt(np.trace(window.pose_covariance[3:, 3:])))
-        return not self._differential and sigma <= self._settings.reanchor * self._anchor_sigma
+        if self._differential:
+            return sigma < SIGMA_CYCLES
+        return sigma <= self._settings.reanchor * self._anchor_sigma
 
     def _antenna(self, state: InertialState) -> tuple[F64, F64]:
         """Position (3,) m and velocity (3,) m/s of the antenna in world."""

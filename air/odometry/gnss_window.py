@@ -18,6 +18,7 @@ from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
 from air.odometry.gnss_biases import BiasNode, first_node, needed, next_node
 from air.odometry.gnss_factors import antenna_motion, linearise, total
+from air.odometry.gnss_fixing import fix
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssSettings
 from air.odometry.preintegration import ImuBuffer
@@ -73,7 +74,7 @@ class GnssWindow:
         self._stretches: list[_Stretch] = []
         self._nodes: list[BiasNode] = []
         self._links: list[Quadratic] = []
-        self._adjusted = -1
+        self._adjusted = self._tried = -1
 
     def add(self, window: Window, epoch: CleanEpoch) -> bool:
         """Take an epoch that IMU samples cover; whether a keyframe lies before it, and the IMU tells the way there."""
@@ -87,6 +88,22 @@ class GnssWindow:
         stretch.taken.append(taken)
         own = self._linearised(window.values, stretch, [taken])
         stretch.known = own if stretch.known is None else _sum(stretch.known.at(window.values), own)
+        return True
+
+    def fix(self, window: Window) -> bool:
+        """Whether ambiguities of differences to a base station have just become whole cycles, once for each node."""
+        if not self._differential or not self._nodes or self._nodes[-1].index in (self._tried, self._adjusted + 1):
+            return False
+        node = self._nodes[-1]
+        try:
+            covariance = window.covariance_of(node.key)
+        except (RuntimeError, np.linalg.LinAlgError):
+            return False
+        self._tried = node.index
+        found = fix(node, window.values.atVector(node.key), covariance)
+        if isinstance(found, str):
+            return False
+        self._links.append(found)
         return True
 
     def terms(self, window: Window) -> list[Quadratic]:

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
-from air.odometry.adjustment import Unknowns, adjust, equations_of
+from air.odometry.adjustment import Unknowns, adjust, covariance_of, equations_of
 from air.odometry.initial_prior import initial_prior
 from air.odometry.landmarks import View, locate, outliers, rms_px
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
@@ -244,17 +244,24 @@ class Window:
     def _adjust(self) -> int:
         """Iterations that it took."""
         known = self._known()
+        adjusted = adjust(self._graph(), known, self.values, self._unknowns(known), self._settings.iterations)
+        self.values, self._covariance = adjusted.values, adjusted.covariance
+        return adjusted.iterations
+
+    def covariance_of(self, key: int) -> F64:
+        """Covariance (D, D) of a companion's variable. Raises RuntimeError or LinAlgError where it is undetermined."""
+        known = self._known()
+        return covariance_of(key, self._graph(), known, self.values, self._unknowns(known))
+
+    def _unknowns(self, known: list[Quadratic]) -> Unknowns:
         frames = [key for f in self.frames for key in (V(f.k), B(f.k), X(f.k))]
         anchored = [L(i) for i in self._anchored]
         others = {key for one in known for key in one.point}.difference(frames, anchored)
-        unknowns = Unknowns(
+        return Unknowns(
             points=[L(i) for i in sorted(self.points - self._anchored)],
             chain=sorted(others),
             poses=[X(f.k) for f in self.frames],
         )
-        adjusted = adjust(self._graph(), known, self.values, unknowns, self._settings.iterations)
-        self.values, self._covariance = adjusted.values, adjusted.covariance
-        return adjusted.iterations
 
     def _known(self) -> list[Quadratic]:
         """What is known beside the factors that gtsam knows."""
