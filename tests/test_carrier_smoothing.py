@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from gnss_scene import broadcast, rover, sky
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from air.__main__ import main
 from air.gnss.ephemerides import Ephemerides
@@ -16,8 +20,9 @@ from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
 from air.gnss.positioning import PointPosition, find_position
 from air.gnss.settings import PositioningSettings
-from air.odometry.carrier_smoothing import Carriers, CarrierSmoother, Way, find_way
+from air.odometry.carrier_smoothing import Carriers, CarrierSmoother, Way, way_by_carriers
 from air.positions import find_smooth_positions
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.source import open_source
 from common.arrays import F64
 from common.geo import geodetic_to_ecef
@@ -27,13 +32,13 @@ NEAR = geodetic_to_ecef(30.5, 114.4, 50.0)
 
 
 def smooth(url: str) -> tuple[list[PointPosition], list[PointPosition], list[Way | None]]:
-    """Single points of a recording, the same smoothed, and the ways between them as carriers tell."""
-    broadcast, settings = Ephemerides(), PositioningSettings()
-    smoother, single, ways = CarrierSmoother(broadcast, settings), list[PointPosition](), list[Way | None]()
+    """Single points of a recording, the same smoothed, and the ways between them as carriers or Dopplers tell."""
+    known, options = Ephemerides(), PositioningSettings()
+    smoother, single, ways = CarrierSmoother(known, options), list[PointPosition](), list[Way | None]()
     for message in open_source(url):
-        broadcast.add(message)
+        known.add(message)
         if isinstance(message, GnssEpoch):
-            fix = find_position(message, broadcast, settings, single[-1].position if single else None)
+            fix = find_position(message, known, options, single[-1].position if single else None)
             if isinstance(fix, PointPosition):
                 single.append(fix)
                 ways.append(smoother.add(message, fix))
@@ -41,7 +46,7 @@ def smooth(url: str) -> tuple[list[PointPosition], list[PointPosition], list[Way
 
 
 def jumps(positions: list[PointPosition], ways: list[Way | None]) -> F64:
-    """By how much (J,) m the step from one position to the next differs from the way of the carriers."""
+    """By how much (J,) m the step from one position to the next differs from the way between them."""
     steps = zip(pairwise(positions), ways[1:], strict=True)
     return np.array([np.linalg.norm(b.position - a.position - way.moved) for (a, b), way in steps if way is not None])
 
@@ -87,20 +92,48 @@ def test_a_slip_that_nobody_noticed_is_left_out() -> None:
     moved = np.array([1.2, -0.7, 0.3])
     now = carriers(moved, 1e5)
     now.carrier[3] += 0.19
-    way = find_way(carriers(np.zeros(3), 0.0), now, NEAR + 5.0)
+    way = way_by_carriers(carriers(np.zeros(3), 0.0), now, NEAR + 5.0)
     assert way is not None
     assert way.moved == pytest.approx(moved, abs=0.005)  # the line of sight turns with the place
 
 
 def test_too_few_carriers_tell_no_way() -> None:
     before, now = carriers(np.zeros(3), 0.0, count=5), carriers(np.ones(3), 0.0, count=5)
-    assert find_way(before, now, NEAR) is not None
+    assert way_by_carriers(before, now, NEAR) is not None
     now.carrier[2] += 0.5
-    assert find_way(before, now, NEAR) is None
+    assert way_by_carriers(before, now, NEAR) is None
     four = Carriers(now.arc[:4], now.carrier[:4], now.p_satellite[:4])
-    assert find_way(before, four, NEAR) is None
+    assert way_by_carriers(before, four, NEAR) is None
     none = Carriers(now.arc[:0], now.carrier[:0], now.p_satellite[:0])
-    assert find_way(before, none, NEAR) is None
+    assert way_by_carriers(before, none, NEAR) is None
+
+
+def test_a_car_keeps_its_way_where_bridges_break_most_carriers(real_data: Callable[[str], Path]) -> None:
+    single, smoothed, ways = smooth(f"comma2k19:{real_data('comma2k19') / 'segment'}")
+    assert sum(way is None for way in ways) < 5
+    assert jumps(single, ways).max() > 2.0
+    assert jumps(smoothed, ways).max() < 0.5
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1))
+def test_nonsense_never_ends_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    known, options = Ephemerides(broadcast(sky(GnssOptions()), 10.0)), PositioningSettings()
+    smoother = CarrierSmoother(known, options)
+    for o in EPOCHS:
+        change = {
+            name: np.where(rng.random(len(o.satellites)) < 0.1, rng.choice([np.nan, 0.0, -1e9, 1e300]), value)
+            for name, value in vars(o).items()
+            if isinstance(value, np.ndarray) and value.dtype == np.float64
+        }
+        fix = find_position(epoch := replace(o, **change), known, options)
+        if isinstance(fix, PointPosition):
+            smoother.add(epoch, fix)
+    assert all(np.isfinite(one.position).all() for one in smoother.smoothed())
+
+
+EPOCHS = [o.epoch for o in rover(GnssOptions(), 1.5).observations()]
 
 
 def test_the_command_writes_smooth_positions(

@@ -24,7 +24,7 @@ from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.survey import START_NS
 from air.sources.source import open_source
 from common.arrays import F64
-from common.measurements import GnssEpoch
+from common.measurements import GnssEpoch, KeplerEphemeris
 
 PERFECT = GnssOptions.perfect()
 
@@ -154,6 +154,19 @@ def test_a_base_takes_off_what_both_have() -> None:
     assert np.abs(spread(apart, apart.code)).max() > 1.0
     assert np.abs(spread(both, both.code)).max() < 0.05
     assert both.sigma_slow.max() < 0.1 * apart.sigma_slow.max()
+
+
+def test_ranges_of_satellites_that_tell_no_group_delay_are_worth_less() -> None:
+    """A precise orbit comes without one, and GPS's differ by 5 m."""
+    told, untold = preprocessor(), GnssPreprocessor(GnssSettings())
+    for message in broadcast(sky(PERFECT), 10.0):
+        untold.add(replace(message, source="SP3") if isinstance(message, KeplerEphemeris) else message)
+    epochs = [o.epoch for o in observed(seconds=2.0)]
+    known, unknown = (clean_all(cleaner, epochs)[-1] for cleaner in (told, untold))
+    assert known.satellites == unknown.satellites
+    gps = np.array([name == "G" for name in known.systems])
+    assert np.all(unknown.sigma_slow[gps] > 3.0)
+    assert np.all(known.sigma_slow[gps] < 0.8 * unknown.sigma_slow[gps])
 
 
 @settings(max_examples=25)

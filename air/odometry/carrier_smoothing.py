@@ -1,9 +1,10 @@
 """Single-point positions joined by the carriers that two epochs share.
 
-Pseudoranges tell where the antenna is within metres, and unbroken carriers how far it moved since within centimetres.
-A Kalman smoother weighs both. Most of a single point's error stays for minutes, and it knows that: many epochs do not
-make it small. Sources: van Graas and Soloviev, Precise Velocity Estimation Using a Stand-Alone GPS Receiver (2004);
-Brown and Hwang, Introduction to Random Signals, chapters 6 (smoothing) and 9 (errors that wander).
+Pseudoranges tell where the antenna is within metres. Unbroken carriers tell how far it moved since within centimetres,
+or Dopplers within decimetres where carriers are few. A Kalman smoother weighs all. Most of a single point's error
+stays for minutes, and it knows that: many epochs do not make it small. Sources: van Graas and Soloviev, Precise
+Velocity Estimation Using a Stand-Alone GPS Receiver (2004); Brown and Hwang, Introduction to Random Signals, chapters
+6 (smoothing) and 9 (errors that wander).
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from common.measurements import GnssEpoch
 
 SIGMA_MOVED = 0.03
 """One sigma of the difference of a carrier between two epochs, m, as a hand-held antenna has it."""
+CHANGE = 0.5
+"""How far the velocity departs from the mean of two Dopplers between them, m/s for each second that takes."""
 SLOW, SLOW_S = 0.9, 300.0
 """Share of a single point's variance that stays, and for how long: multipath, air and orbits."""
 _LEAST_CHECKED = 1
@@ -50,7 +53,7 @@ class Carriers:
     p_satellite: F64
 
 
-def find_way(before: Carriers, now: Carriers, near: F64) -> Way | None:
+def way_by_carriers(before: Carriers, now: Carriers, near: F64) -> Way | None:
     """The way between two epochs, None where their common carriers are too few to check each other.
 
     `near` (3,) m, ECEF, is where the antenna was within some hundred metres. Carriers that contradict the others are
@@ -79,6 +82,16 @@ def find_way(before: Carriers, now: Carriers, near: F64) -> Way | None:
     return None
 
 
+def way_by_doppler(before: PointPosition, now: PointPosition) -> Way | None:
+    """The way between two positions as their velocities tell, None where one has none."""
+    dt_s = (now.t_ns - before.t_ns) / SECOND_NS
+    moved = (before.velocity + now.velocity) / 2 * dt_s
+    if not np.isfinite(moved).all():
+        return None
+    noise = (before.velocity_covariance + now.velocity_covariance) / 4
+    return Way(moved, noise * dt_s**2 + (CHANGE * dt_s**2) ** 2 * np.eye(3))
+
+
 @dataclass(frozen=True, eq=False)
 class _Joined:
     """A single point, the way to it from the one before, None where it begins anew, and how long that took."""
@@ -99,7 +112,7 @@ class CarrierSmoother:
         self._joined: list[_Joined] = []
 
     def add(self, epoch: GnssEpoch, fix: PointPosition) -> Way | None:
-        """Take an epoch and its position; how far the antenna moved since the last one, if carriers tell."""
+        """Take an epoch and its position; how far the antenna moved since the last one, if that is known."""
         signals = correct(epoch, self._broadcast, fix.position)
         arcs = self._locks.step(epoch.t_ns / SECOND_NS, signals, epoch.lock_s[signals.row])
         good = (arcs >= 0) & signals.first & (signals.elevation >= np.radians(self._settings.elevation_mask_deg))
@@ -108,7 +121,9 @@ class CarrierSmoother:
         dt_s = (fix.t_ns - self._joined[-1].fix.t_ns) / SECOND_NS if self._joined else 0.0
         way = None
         if self._last is not None and 0.0 < dt_s <= LONGEST_GAP_S:
-            way = find_way(self._last, carriers, fix.position)
+            told = way_by_carriers(self._last, carriers, fix.position), way_by_doppler(self._joined[-1].fix, fix)
+            known = [one for one in told if one is not None]
+            way = min(known, key=lambda one: float(np.trace(one.covariance)), default=None)
         self._last = carriers
         self._joined.append(_Joined(fix, way, dt_s))
         return way
