@@ -46,9 +46,11 @@ class Condition:
 class LiveMap:
     """The map of a flight while it grows (core: no clock, no stream)."""
 
-    def __init__(self, flight: str, config: AirConfig) -> None:
+    def __init__(self, flight: str, config: AirConfig, datum: Datum | None = None) -> None:
+        """Without a `datum` the world begins at the first photo that matches another."""
         self._flight = flight
         self._alignment = Alignment(flight, config.alignment)
+        self._alignment.datum = datum
         self._mapper = Mapper(config.mapping)
         self._photos = 0
 

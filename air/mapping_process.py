@@ -1,5 +1,4 @@
-"""The mapper in a process of its own beside the node of the devices: gtsam holds the interpreter for long, and a device
-that is not read in time loses bytes."""
+"""The mapper in a process of its own beside the odometry: its adjustments hold the interpreter for seconds."""
 
 from __future__ import annotations
 
@@ -7,18 +6,16 @@ import logging
 import multiprocessing
 import queue
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from logging.handlers import QueueHandler, QueueListener
+from multiprocessing.context import SpawnProcess
 from multiprocessing.queues import Queue
 from typing import Any
 
 from air.config import AirConfig
-from air.sensors.calibration import Calibration
 from air.sources.source import Problem, Truth
-from air.sources.stills import StillPicker
-from common.measurements import Measurement
-from common.messages import Photo
+from common.messages import Datum, Photo
 
 log = logging.getLogger(__name__)
 
@@ -29,23 +26,21 @@ LOOK_S = 0.2
 
 
 class MappingProcess:
-    """Maps the photos in what devices measure. The process begins with the first photo."""
+    """Maps the photos of a flight. The process begins with the first one."""
 
-    def __init__(self, config: AirConfig, cameras: Mapping[str, Calibration]) -> None:
-        # It listens nowhere: that is the place of the node of the devices.
-        self._config = replace(config, bus=replace(config.bus, listen=()))
-        self._picker = StillPicker(cameras)
-        context = multiprocessing.get_context("spawn")
-        self._photos: Queue[Photo | None] = context.Queue(WAITING)
-        self._records: Queue[Any] = context.Queue()
-        self._process = context.Process(target=_map, args=(self._config, self._photos, self._records), name="mapping")
+    def __init__(self, config: AirConfig, flight: str) -> None:
+        self._config, self._flight = config, flight
+        self._context = multiprocessing.get_context("spawn")
+        self._photos: Queue[Photo | None] = self._context.Queue(WAITING)
+        self._records: Queue[Any] = self._context.Queue()
+        self._process: SpawnProcess | None = None
         self._listener = QueueListener(self._records, *logging.getLogger().handlers)
 
-    def take(self, measurement: Measurement) -> None:
-        """Note a measurement; a frame that makes a photo goes to the mapper, unless too many wait there."""
-        if (photo := self._picker.feed(measurement)) is None:
-            return
-        if self._process.pid is None:
+    def take(self, photo: Photo, datum: Datum) -> None:
+        """Hand a photo to the mapper, unless too many wait there. The datum that came first stays."""
+        if self._process is None:
+            given = (self._config, self._flight, datum, self._photos, self._records)
+            self._process = self._context.Process(target=_map, args=given, name="mapping")
             self._listener.start()
             self._process.start()
         try:
@@ -55,12 +50,13 @@ class MappingProcess:
 
     def finish(self) -> None:
         """No more photos come: the mapper adjusts all of them once more, and stays for those who ask."""
-        if self._process.pid is not None:
+        if self._process is not None:
             self._photos.put(None)
 
     def close(self) -> None:
         """End the process, if it began."""
-        if self._process.pid is None:
+        self._photos.cancel_join_thread()
+        if self._process is None:
             return
         self._process.terminate()
         self._process.join(STOP_S)
@@ -90,13 +86,13 @@ class Taken:
             yield photo
 
 
-def _map(config: AirConfig, photos: Queue[Photo | None], records: Queue[Any]) -> None:
+def _map(config: AirConfig, flight: str, datum: Datum, photos: Queue[Photo | None], records: Queue[Any]) -> None:
     """The process: until SIGTERM."""
     root = logging.getLogger()
     root.addHandler(QueueHandler(records))
     root.setLevel(logging.INFO)
     from air.nodes import map_photos
 
-    # Ctrl-C reaches every process of a terminal; the node of the devices tells this one when to end.
+    # Ctrl-C reaches every process of a terminal; the odometry tells this one when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    map_photos(config, lambda check_stop: Taken(photos, check_stop))
+    map_photos(config, flight, datum, lambda check_stop: Taken(photos, check_stop))

@@ -29,14 +29,15 @@ class Navigator:
         flight: str,
         settings: OdometrySettings,
         stage: Stage = unwatched,
+        datum: Datum | None = None,
     ) -> None:
-        """`stage` watches the parts of the work."""
+        """`stage` watches the parts of the work; `datum`, when the flight has one already, stays."""
         self._flight = flight
         self._camera, calibration = mounted(known) or ("", None)
         self.odometry = Odometry(calibration, flight, with_lever_arm(settings, known), known.p_base_ecef, stage)
         self._picker = StillPicker(known.cameras)
         self._T_flight_odometry = SE3.identity()
-        self.datum: Datum | None = None
+        self.datum = datum
 
     def feed(self, measurement: Sensed) -> list[Output | Photo]:
         """What it tells: the datum once, before any pose and any photo; each photo carries what was known of it."""

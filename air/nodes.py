@@ -9,17 +9,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 
 from air.config import AirConfig
+from air.flight import flight_now
 from air.live import LiveMap
 from air.preparation import prepared
+from air.sources.navigated import Navigated
 from air.sources.source import PhotoSource, open_photos
 from air.uplink.uplink import Uplink
 from air.warm_up import warm_up
 from common.bus import ZenohBus
 from common.clock import SystemClock
-from common.messages import Keyframe, Photo
+from common.messages import Datum, Keyframe, Photo
 
 log = logging.getLogger(__name__)
 
@@ -37,14 +38,21 @@ def fly(config: AirConfig, url: str | None = None) -> int:
     Raises SourceError, also when the source fails on the way, and BusError.
     """
     stop = threading.Event()
-    source = open_photos(url or config.source, config.pace, sleep=_sleep_until(stop))
+    source = open_photos(
+        url or config.source,
+        config.pace,
+        photos_of=lambda source: Navigated(source, config.odometry),
+        sleep=_sleep_until(stop),
+    )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    return _fly(config, source, stop)
+    return _fly(config, flight_now(), None, source, stop)
 
 
-def map_photos(config: AirConfig, source_until: Callable[[Callable[[], None]], PhotoSource]) -> int:
-    """Exit code 0 after SIGTERM; until then maps photos that come from elsewhere and sends the map.
+def map_photos(
+    config: AirConfig, flight: str, datum: Datum, source_until: Callable[[Callable[[], None]], PhotoSource]
+) -> int:
+    """Exit code 0 after SIGTERM; until then maps photos that come from elsewhere, around a datum, and sends the map.
 
     `source_until` makes their source from a function that raises once they are not wanted any more. Raises BusError.
     """
@@ -55,16 +63,15 @@ def map_photos(config: AirConfig, source_until: Callable[[Callable[[], None]], P
         if stop.is_set():
             raise StoppedError
 
-    return _fly(config, source_until(check_stop), stop)
+    return _fly(config, flight, datum, source_until(check_stop), stop)
 
 
-def _fly(config: AirConfig, source: PhotoSource, stop: threading.Event) -> int:
-    flight = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+def _fly(config: AirConfig, flight: str, datum: Datum | None, source: PhotoSource, stop: threading.Event) -> int:
     log.info("flight %s of %s: photos from %s", flight, config.vehicle, source.url)
     warm_up()
     bus = ZenohBus(config.bus)
     uplink = Uplink(bus, config.vehicle, flight, config.uplink, SystemClock().now_ns)
-    mapping = Mapping(LiveMap(flight, config), source, config, uplink, stop)
+    mapping = Mapping(LiveMap(flight, config, datum), source, config, uplink, stop)
     try:
         uplink.start()
         mapping.start()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from air.config import AirConfig
 from air.devices.status import DeviceStatus
-from air.mapping_process import MappingProcess
-from air.sensors.calibration import Calibration
+from air.odometry_process import OdometryProcess
+from air.sources.known import Known
 from air.sources.live import Live
 from air.sources.source import open_source
 from common.bus import Bus, ZenohBus
@@ -37,8 +37,8 @@ class Devices(Protocol):
     def __iter__(self) -> Iterator[Measurement]: ...
 
     @property
-    def cameras(self) -> Mapping[str, Calibration]:
-        """What is known of the cameras, by name."""
+    def known(self) -> Known:
+        """What was calibrated before the flight."""
         ...
 
     def statuses(self) -> list[DeviceStatus]:
@@ -55,7 +55,8 @@ class Devices(Protocol):
 
 
 def sense(config: AirConfig, url: str) -> int:
-    """Exit code 0 after SIGINT or SIGTERM; until then publishes what devices measure, and maps what they see.
+    """Exit code 0 after SIGINT or SIGTERM; until then publishes what devices measure, where that says that the aircraft
+    is, and the map of what it sees.
 
     `live:` alone takes the devices of `config`; a simulated flight, `sim:plain` and the like, is flown at the pace of
     time. Raises SourceError, ConfigError and BusError.
@@ -70,14 +71,14 @@ def sense(config: AirConfig, url: str) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     bus = ZenohBus(config.bus)
-    mapping = MappingProcess(config, live.cameras)
-    sensing = Sensing(live, bus, config.vehicle, SystemClock(), mapping.take)
+    odometry = OdometryProcess(config, live.known)
+    sensing = Sensing(live, bus, config.vehicle, SystemClock(), odometry.take)
     try:
         sensing.run()
-        mapping.finish()
+        odometry.finish()
         stop.wait()
     finally:
-        mapping.close()
+        odometry.close()
         live.close()
         bus.close()
     return 0

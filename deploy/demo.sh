@@ -5,7 +5,7 @@ set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 python=${PYTHON:-$root/.venv/bin/python}
-source=${1:-sim:playground?seed=1&duration=300&camera.rate_hz=2&base=off}
+source=${1:-sim:playground?seed=1&duration=300&camera.rate_hz=5&base=off}
 viewer_port=8080
 bus_port=7447
 

@@ -72,7 +72,7 @@ class Alignment:
     def finish(self) -> list[Keyframe]:
         """All keyframes after the final adjustment of all photos."""
         self._grow()
-        if self.datum is not None:
+        if self.placed:
             self._adjust_all(final=True)
         return self._moved(threshold=-1.0)
 

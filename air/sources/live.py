@@ -17,6 +17,7 @@ from air.devices.status import DeviceStatus
 from air.sensors.calibration import Calibration
 from air.sensors.driver import Driver, TimeScale
 from air.sensors.rtcm import RtcmFilter
+from air.sources.known import Known
 from air.sources.source import Problem, Truth
 from air.timing import Timebase
 from common.clock import Clock, SystemClock
@@ -80,9 +81,9 @@ class Live:
         return [problem for problem in found if problem.name not in well]
 
     @property
-    def cameras(self) -> Mapping[str, Calibration]:
-        """The calibration of the camera by its name, when there is one."""
-        return self._cameras
+    def known(self) -> Known:
+        """The calibration of the camera, when there is one."""
+        return Known(self._cameras)
 
     def statuses(self) -> list[DeviceStatus]:
         """How each device is doing now."""

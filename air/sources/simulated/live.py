@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 
 from air.devices.status import DeviceStatus, Watch
-from air.sensors.calibration import Calibration
+from air.sources.known import Known
 from air.sources.simulated.flown import Heard, SimulatedFlight
 from common.measurements import Measurement
 
@@ -24,9 +24,9 @@ class LiveFlight:
         self._watches: dict[str, Watch] = {}
 
     @property
-    def cameras(self) -> Mapping[str, Calibration]:
-        """What was calibrated of the cameras, by name."""
-        return self._flight.known.cameras
+    def known(self) -> Known:
+        """What was calibrated before the flight."""
+        return self._flight.known
 
     def statuses(self) -> list[DeviceStatus]:
         """How each device that was heard is doing now."""

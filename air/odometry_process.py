@@ -1,0 +1,132 @@
+"""The odometry in a process of its own, between the node of the devices and the mapper: its adjustments hold the
+interpreter for tens of milliseconds, those of the mapper for seconds, and neither may wait for the other."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import queue
+import signal
+import threading
+import time
+from dataclasses import replace
+from logging.handlers import QueueHandler, QueueListener
+from multiprocessing.queues import Queue
+from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.synchronize import BoundedSemaphore
+from typing import Any
+
+from air.config import AirConfig
+from air.flight import flight_now
+from air.sources.known import Known
+from common.measurements import CameraFrame, ClockState, ImuSample, Measurement, RawBytes
+
+log = logging.getLogger(__name__)
+
+FRAMES = 4
+"""Frames that may wait; more are dropped, for the newest pose is worth more than every frame."""
+WAITING = 20_000
+"""Measurements that may wait, which are small: while the process starts, and when the computer is held up."""
+STOP_S = 5.0
+"""More than the mapper, which this process ends, may take to end."""
+LOOK_S = 0.2
+Item = tuple[float, Measurement] | None
+"""A measurement with the monotonic time s at which it was put; None at the end."""
+
+
+class OdometryProcess:
+    """Follows the aircraft through what its devices measure. The process begins with the first sample or frame."""
+
+    def __init__(self, config: AirConfig, known: Known) -> None:
+        # It listens nowhere: that is the place of the node of the devices.
+        config = replace(config, bus=replace(config.bus, listen=()))
+        context = multiprocessing.get_context("spawn")
+        self._measurements: Queue[Item] = context.Queue(WAITING)
+        self._room: BoundedSemaphore = context.BoundedSemaphore(FRAMES)
+        self._dropped: Synchronized[int] = context.Value("L", 0)
+        self._records: Queue[Any] = context.Queue()
+        shared = (self._measurements, self._room, self._dropped, self._records)
+        self._process = context.Process(target=_navigate, args=(config, known, flight_now(), *shared), name="odometry")
+        self._listener = QueueListener(self._records, *logging.getLogger().handlers)
+        self._ended = False
+
+    def take(self, measurement: Measurement) -> None:
+        """Hand a measurement on; a frame for which there is no room is dropped and counted. Returns at once."""
+        if self._ended or isinstance(measurement, RawBytes | ClockState):
+            return
+        if isinstance(measurement, CameraFrame) and not self._room.acquire(block=False):
+            self._drop()
+            return
+        try:
+            self._measurements.put_nowait((time.monotonic(), measurement))
+        except queue.Full:
+            self._drop()
+        if self._process.pid is None and isinstance(measurement, CameraFrame | ImuSample):
+            self._listener.start()
+            self._process.start()
+        elif self._process.exitcode is not None:
+            self._ended = True
+            log.error("the odometry has ended with exit code %d: there are no poses and no map", self._process.exitcode)
+
+    def finish(self) -> None:
+        """No more measurements come: the mapper adjusts all photos once more, and stays for those who ask."""
+        if self._process.pid is not None and not self._ended:
+            self._measurements.put(None)
+
+    def close(self) -> None:
+        """End the process, if it began."""
+        # What was put and not taken must not hold up the end of this program.
+        self._measurements.cancel_join_thread()
+        if self._process.pid is None:
+            return
+        self._process.terminate()
+        self._process.join(STOP_S)
+        self._process.kill()
+        self._listener.stop()
+
+    def _drop(self) -> None:
+        with self._dropped.get_lock():
+            self._dropped.value += 1
+
+
+def _navigate(
+    config: AirConfig,
+    known: Known,
+    flight: str,
+    measurements: Queue[Item],
+    room: BoundedSemaphore,
+    dropped: Synchronized[int],
+    records: Queue[Any],
+) -> None:
+    """The process: until SIGTERM, or until the one that it serves is gone."""
+    root = logging.getLogger()
+    root.addHandler(QueueHandler(records))
+    root.setLevel(logging.INFO)
+    stop, parent = threading.Event(), multiprocessing.parent_process()
+    # Ctrl-C reaches every process of a terminal; the node of the devices tells this one when to end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    from air.mapping_process import MappingProcess
+    from air.odometry_node import OdometryNode
+    from common.bus import ZenohBus
+
+    bus, mapping = ZenohBus(config.bus), MappingProcess(config, flight)
+    node = OdometryNode(config, known, flight, bus, mapping.take)
+    try:
+        while not stop.is_set() and (parent is None or parent.is_alive()):
+            node.beat(dropped.value)
+            try:
+                item = measurements.get(timeout=LOOK_S)
+            except queue.Empty:
+                continue
+            if item is None:
+                mapping.finish()
+                continue
+            put_s, measurement = item
+            node.take(measurement)
+            if isinstance(measurement, CameraFrame):
+                room.release()
+                node.note_delay(time.monotonic() - put_s)
+    finally:
+        mapping.close()
+        bus.close()
