@@ -15,7 +15,6 @@ from air.odometry.tracker import TrackedFrame
 from air.sensors.calibration import Calibration
 from air.sources.simulated.motion.trajectory import Trajectory
 from air.sources.source import open_source
-from air.trajectory import calibration_of
 from common.measurements import CameraFrame, ClockState, ImuSample, RawBytes
 from common.messages import Datum
 
@@ -98,7 +97,7 @@ def _fly(url):
     aircraft, settings = source.aircraft, OdometrySettings()
     lever = aircraft.nominal_extrinsics.p_body_antenna
     settings = replace(settings, gnss=replace(settings.gnss, p_body_antenna=tuple(lever.tolist())))
-    calibration = calibration_of(source, CAMERA)
+    calibration = source.known.cameras[CAMERA]
     odometry, messages, tracker_s = Odometry(calibration, "flight", settings), [], {}
     odometry.estimator = _Listening(calibration.camera.fx, calibration.T_body_cam, settings, "flight")
     for message in tqdm(_fed(source), url, unit=" items", leave=False, disable=None):
