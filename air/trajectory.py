@@ -42,8 +42,8 @@ def find_trajectory(
 ) -> TrajectoryReport:
     """The report of a source's trajectory, after files have been written into `out`.
 
-    These are `trajectory.tum` (body, at the rate of the IMU), `keyframes.tum` (camera), `report.json`, and where GNSS
-    has told where the world lies, `datum.json`. A source without frames is found by GNSS and IMU.
+    These are `trajectory.tum` (body, at the rate of the IMU), `report.json`, with a camera `keyframes.tum`, and where
+    GNSS has told where the world lies, `datum.json`. Without a camera GNSS and IMU alone tell the trajectory.
 
     Raises SourceError, CalibrationError where the camera is not known, and ExportError where nothing can be written.
     """
@@ -98,7 +98,8 @@ def _write(out: Path, told: Told, report: TrajectoryReport) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_tum(out / "trajectory.tum", [p.t_ns for p in told.poses], [p.T_world_body for p in told.poses])
-        write_tum(out / "keyframes.tum", [k.t_ns for k in told.keyframes], [k.T_world_cam for k in told.keyframes])
+        if report.frames:
+            write_tum(out / "keyframes.tum", [k.t_ns for k in told.keyframes], [k.T_world_cam for k in told.keyframes])
         if told.datum is not None:
             write_datum(out / "datum.json", told.datum)
         (out / "report.json").write_text(json.dumps(asdict(report), indent=2) + "\n")

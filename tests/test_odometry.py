@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from air.odometry.odometry import Odometry, Output, decoded
 from air.sensors.calibration import Calibration, to_toml
 from air.sources.source import open_source
 from common.camera import CameraModel
+from common.export.datum import read_datum
 from common.export.trajectory import read_tum
 from common.measurements import CameraFrame, Encoding, FixKind, ImuSample, ReceiverSolution
 from common.messages import EstimatorState, Mode, Pose
@@ -117,6 +119,23 @@ def test_a_receiver_tells_gravity_before_it_begins() -> None:
 def test_a_camera_that_sits_nowhere_is_refused() -> None:
     with pytest.raises(ValueError, match="T_body_cam"):
         Odometry(Calibration(CAMERA), "flight")
+
+
+def test_a_drive_without_a_camera_is_found_by_gnss_and_imu(real_data: Callable[[str], Path], tmp_path: Path) -> None:
+    assert main(["odometry", f"comma2k19:{real_data('comma2k19')}", "--out", str(tmp_path), "--quiet"]) == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["camera"], report["frames"], report["odometry"]["keyframes"]) == ("", 0, 0)
+    assert report["odometry"]["world_found_s"] < 20.0
+    assert report["odometry"]["modes_s"]["gnss-inertial"] > 40.0
+    assert len(read_tum(tmp_path / "trajectory.tum").t_ns) == report["odometry"]["poses"] > 4000
+    assert read_datum(tmp_path / "datum.json").latitude_deg == pytest.approx(37.7, abs=0.5)
+    assert not (tmp_path / "keyframes.tum").exists()
+
+
+def test_without_a_calibration_frames_are_refused() -> None:
+    odometry = Odometry(None, "flight")
+    assert not fed(odometry, standing(1.0, np.random.default_rng(1)))
+    assert odometry.refused_frames == 10
 
 
 def test_the_command_says_what_it_misses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

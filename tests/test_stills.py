@@ -15,7 +15,7 @@ from air.sources.stills import STEP, StillPicker
 from common.camera import CameraModel
 from common.geo import enu_to_geodetic, geodetic_to_enu
 from common.measurements import CameraFrame, Encoding, FixKind, ReceiverSolution, VehicleState
-from common.messages import Datum, Photo
+from common.messages import Datum, Mode, Photo, Pose
 from common.se3 import SE3
 
 HOME = Datum("", 30.5, 114.3, 20.0)
@@ -113,6 +113,39 @@ def test_frames_of_a_second_camera_and_of_video_streams_are_left_alone() -> None
     assert picker.feed(frame(20.1, camera="front")) is None
     assert picker.feed(CameraFrame(20 * SECOND_NS, "down", 9, 128, 72, Encoding.H264, b"\0\0\0\1")) is None
     assert picker.feed(frame(20.1)) is not None
+
+
+def pose(t_s: float, error: float = 0.0) -> Pose:
+    """The odometry's, which knows better than the receiver by how much that is off."""
+    T_world_body = SE3(np.eye(3), np.array([SPEED * t_s + error, 0.0, HEIGHT]))
+    return Pose("", round(t_s * 1e9), 1, T_world_body, None, np.array([0.3, 0.4, 0.7]), Mode.GNSS_VISUAL_INERTIAL)
+
+
+def test_once_the_odometry_knows_its_world_photos_are_where_it_says_until_it_falls_silent() -> None:
+    """Poses come 20 ms apart, from 10 s to 30 s, 5 m east of where the receiver believes to be."""
+
+    def navigated() -> Iterator[Sensed | Datum | Pose]:
+        for m in flight(60):
+            if m.t_ns == 10 * SECOND_NS:
+                yield HOME
+            yield m
+            if isinstance(m, CameraFrame) and 10 * SECOND_NS <= m.t_ns < 30 * SECOND_NS:
+                yield from (pose(m.t_ns * 1e-9 + k * 0.02 + 0.007, 5.0) for k in range(5))
+
+    picker = StillPicker(MOUNTED)
+    taken = [photo for m in navigated() if (photo := picker.feed(m)) is not None]
+    for photo in taken:
+        p = geodetic_to_enu(HOME, photo.fix.latitude_deg, photo.fix.longitude_deg, photo.fix.height)
+        off = p - [SPEED * photo.t_ns * 1e-9, 0.0, HEIGHT]
+        if 10.2 < photo.t_ns * 1e-9 < 29.9:
+            assert_allclose(off, [5.0, 0.0, 0.0], atol=1e-3)
+            assert_allclose([photo.fix.sigma_horizontal, photo.fix.sigma_vertical], [np.sqrt(0.125), 0.7])
+            assert_allclose(photo.R_enu_cam, np.diag([1.0, -1.0, -1.0]), atol=1e-4)
+        elif not 9.9 < photo.t_ns * 1e-9 < 30.4:
+            assert_allclose(off, 0.0, atol=0.01)
+            assert photo.R_enu_cam is None
+    assert sum(10.2 < photo.t_ns * 1e-9 < 29.9 for photo in taken) >= 6
+    assert sum(photo.t_ns > 31 * SECOND_NS for photo in taken) >= 8
 
 
 @pytest.mark.slow
