@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gnss_flight import DATUM, START_NS, GnssFlight, estimates, flight, with_frames
+from gnss_flight import BASE_ECEF, DATUM, START_NS, GnssFlight, estimates, flight, with_frames
 from odometry_scene import CAMERA, T_BODY_CAM, Scene
 
 from air.gnss.gnss_time import SECOND_NS
@@ -15,6 +15,7 @@ from air.odometry.estimator import Estimate, Estimator, blind_frame
 from air.odometry.gnss_settings import GnssSettings
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import TrackedFrame
+from air.sources.simulated.gnss.gnss_options import GnssOptions
 from air.sources.simulated.imu import ImuOptions
 from air.sources.simulated.motion.mission import FlightOptions
 from common.arrays import F64
@@ -39,10 +40,12 @@ def flown() -> tuple[GnssFlight, list[object]]:
 class Outcome:
     """Estimates in the world, and where they are off."""
 
-    def __init__(self, flown: tuple[GnssFlight, list[object]], change: Change = lambda _, m: m) -> None:
+    def __init__(
+        self, flown: tuple[GnssFlight, list[object]], change: Change = lambda _, m: m, base: F64 | None = None
+    ) -> None:
         truth, messages = flown
         gnss = GnssSettings(p_body_antenna=truth.p_body_antenna)
-        self.estimator = Estimator(CAMERA.fx, T_BODY_CAM, OdometrySettings(gnss=gnss))
+        self.estimator = Estimator(CAMERA.fx, T_BODY_CAM, OdometrySettings(gnss=gnss), base=base)
         changed = (change((getattr(m, "t_ns", START_NS) - START_NS) / SECOND_NS, m) for m in messages)
         told = estimates(self.estimator, (m for m in changed if m is not None))
         self.first_s = self.at_s(told[0])
@@ -138,3 +141,12 @@ def test_wrong_satellites_do_not_move_the_aircraft(
     found = Outcome(flown, late)
     rmse = [float(np.sqrt(np.mean(np.sum(one.left**2, axis=1)))) for one in (found, undisturbed)]
     assert rmse[0] < 1.5 * rmse[1] + 0.02
+
+
+def test_a_base_station_places_the_aircraft_to_centimetres() -> None:
+    truth = flight(SEED, 22.0, IN_THE_AIR, base=GnssOptions.base())
+    messages = with_frames(truth, Scene(SEED, 22.0, IN_THE_AIR, ImuOptions()))
+    out = Outcome((truth, messages), base=BASE_ECEF)
+    late = out.t_s > out.t_s[0] + 5.0
+    assert late.sum() > 20
+    assert np.linalg.norm(out.off[late], axis=1).max() < 0.08

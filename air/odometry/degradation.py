@@ -35,10 +35,11 @@ class Hysteresis:
 class Monitor:
     """Watches what the estimate rests on."""
 
-    def __init__(self, settings: DegradationSettings) -> None:
+    def __init__(self, settings: DegradationSettings, visual: bool = True, gnss: bool = False) -> None:
+        """`visual` and `gnss` are what it begins with."""
         s = self._settings = settings
-        self._visual = Hysteresis(True, s.lost_s, s.back_s)
-        self._gnss = Hysteresis(False, s.lost_s, s.back_s)
+        self._visual = Hysteresis(visual, s.lost_s, s.back_s)
+        self._gnss = Hysteresis(gnss, s.lost_s, s.back_s)
 
     def found_gnss(self) -> None:
         """GNSS counts from now on: it has just been found to agree."""

@@ -146,6 +146,7 @@ class Estimator:
         if not self.gnss.couple(window, epoch):
             return None
         solution = window.settle()
+        self._fix(window)
         self.revision += 1
         self._monitor.found_gnss()
         self._propagate_from(window.state())
@@ -173,7 +174,7 @@ class Estimator:
         window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
         window.begin(found.state, found.covariance, {})
         self.gnss.join(window, self.gnss.start.datum)
-        self._window, self._monitor = window, Monitor(self._settings.degradation)
+        self._window, self._monitor = window, Monitor(self._settings.degradation, visual=False, gnss=True)
         self._frame_ns = epoch.t_ns
         self.revision += 1
         self._propagate_from(found.state)

@@ -1,4 +1,4 @@
-"""Ambiguities of differences to a base station as whole cycles: what was good to decimetres is then good to centimetres.
+"""Ambiguities of differences to a base station as whole cycles: a place good to decimetres becomes good to centimetres.
 
 Differences between two satellites of one system are free of both receivers' delays, so they are integers. Source:
 Teunissen, Montenbruck (editors), Springer Handbook of GNSS (2017), chapter 23.
@@ -18,6 +18,8 @@ from common.arrays import F64
 
 CODE_DIVISION = "GECJ"
 """Systems whose satellites share a frequency."""
+LEAST, SHARE = 8, 0.6
+"""Fewer differences, and a smaller share of them, are fixed by chance."""
 SIGMA_FIXED = 0.01
 """Of a difference that has been fixed, m."""
 
@@ -28,7 +30,8 @@ def fix(node: BiasNode, u: F64, covariance: F64) -> Quadratic | str:
     if not len(D):
         return "no two carriers of one system"
     scaled = D / wavelength[:, None]
-    found = find_integers(scaled @ u, scaled @ covariance @ scaled.T)
+    # How far the best integers are says little: multipath of carriers makes the real values surer than they are.
+    found = find_integers(scaled @ u, scaled @ covariance @ scaled.T, least=max(LEAST, round(SHARE * len(D))))
     if isinstance(found, str):
         return found
     rows, left = D[found.fixed], (found.integers * wavelength)[found.fixed] - D[found.fixed] @ u

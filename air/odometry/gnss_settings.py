@@ -77,7 +77,7 @@ class GnssSettings:
     """
 
     p_body_antenna: tuple[float, ...] = (0.0, 0.0, 0.0)
-    node_s: Seconds = 2.0
+    node_s: Seconds = 4.0
     max_age_s: Seconds = 60.0
     reanchor: Annotated[float, Range(1.0, 1000.0)] = 1.5
     selection: GnssSelection = field(default_factory=GnssSelection)

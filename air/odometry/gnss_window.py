@@ -31,6 +31,8 @@ GYRO_NS = 20_000_000
 """The rate of turn that swings the antenna is the mean over so long."""
 TURNED, SHIFTED = 0.003, 1.0
 """Epochs are linearised anew once the attitude has turned by rad, or a bias has moved by m, since."""
+TRY_S = 0.5
+"""Between two tries to fix whole cycles."""
 LINE_S, MOST_LINES = 600.0, 500
 """A carrier begins anew after so long: the direction of its satellite has changed too much."""
 MOSTLY = 0.7
@@ -74,7 +76,8 @@ class GnssWindow:
         self._stretches: list[_Stretch] = []
         self._nodes: list[BiasNode] = []
         self._links: list[Quadratic] = []
-        self._adjusted = self._tried = -1
+        self._adjusted = self._fixed = -1
+        self._tried_ns = 0
 
     def add(self, window: Window, epoch: CleanEpoch) -> bool:
         """Take an epoch that IMU samples cover; whether a keyframe lies before it, and the IMU tells the way there."""
@@ -92,18 +95,22 @@ class GnssWindow:
 
     def fix(self, window: Window) -> bool:
         """Whether ambiguities of differences to a base station have just become whole cycles, once for each node."""
-        if not self._differential or not self._nodes or self._nodes[-1].index in (self._tried, self._adjusted + 1):
+        newest_ns = window.frames[-1].t_ns
+        if not self._differential or not self._nodes or newest_ns - self._tried_ns < TRY_S * SECOND_NS:
             return False
         node = self._nodes[-1]
+        if node.index == self._fixed or node.index > self._adjusted:
+            return False
+        self._tried_ns = newest_ns
         try:
             covariance = window.covariance_of(node.key)
         except (RuntimeError, np.linalg.LinAlgError):
             return False
-        self._tried = node.index
         found = fix(node, window.values.atVector(node.key), covariance)
         if isinstance(found, str):
             return False
         self._links.append(found)
+        self._fixed = node.index
         return True
 
     def terms(self, window: Window) -> list[Quadratic]:

@@ -55,6 +55,14 @@ def outliers(views: Sequence[View], points: Mapping[int, F64], focal: float, lim
     return [(int(seen.view[i]), ids[seen.row[i]]) for i in np.flatnonzero(~(error <= limit_px)).tolist()]
 
 
+def depths(points: Mapping[int, F64], T_world_cam: SE3) -> dict[int, float]:
+    """Distance m along the camera's axis of points (3,) m in world, by id; those before the camera."""
+    if not points:
+        return {}
+    z = T_world_cam.inverse().apply(np.array(list(points.values())))[:, 2]
+    return {i: float(d) for i, d in zip(points, z, strict=True) if d > 0}
+
+
 def rms_px(views: Sequence[View], points: Mapping[int, F64], focal: float) -> float:
     """Root mean square distance px between where points should appear and were seen; 0 without any."""
     square, count = 0.0, 0

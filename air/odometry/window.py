@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import B, L, V, X
 
 from air.odometry.adjustment import Unknowns, adjust, covariance_of, equations_of
 from air.odometry.initial_prior import initial_prior
-from air.odometry.landmarks import View, locate, outliers, rms_px
+from air.odometry.landmarks import View, depths, locate, outliers, rms_px
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
 from air.odometry.quadratic import Quadratic, by_world, carried, variable
 from air.odometry.settings import ImuSettings, WindowSettings
@@ -103,11 +103,8 @@ class Window:
 
     def state_at(self, t_ns: int) -> InertialState | None:
         """The state at a time that IMU samples cover; None before the first frame."""
-        for index in range(len(self.frames) - 1, -1, -1):
-            if self.frames[index].t_ns <= t_ns:
-                state = self.state(index)
-                return self.preintegrator.predict(state, self._imu.between(state.t_ns, t_ns))
-        return None
+        before = [i for i, frame in enumerate(self.frames) if frame.t_ns <= t_ns]
+        return self.predict(t_ns, before[-1]) if before else None
 
     @property
     def pose_covariance(self) -> F64:
@@ -120,12 +117,7 @@ class Window:
 
     def depths(self, state: InertialState) -> dict[int, float]:
         """Distance m along the camera's axis of the points, by id, seen from a state; those before the camera."""
-        ids = sorted(self.points)
-        if not ids:
-            return {}
-        T_world_cam = state.T_world_body @ self._T_body_cam
-        z = T_world_cam.inverse().apply(np.array([self.values.atPoint3(L(i)) for i in ids]))[:, 2]
-        return {i: float(d) for i, d in zip(ids, z, strict=True) if d > 0}
+        return depths(self.positions(), state.T_world_body @ self._T_body_cam)
 
     # Frames
 
@@ -137,9 +129,9 @@ class Window:
         self.frames.append(Frame(k, state.t_ns, xy))
         self._prior, self._covariance = initial_prior(k, state, covariance, self._imu_settings), covariance[:6, :6]
 
-    def predict(self, t_ns: int) -> InertialState:
-        """Where the newest state leads to by the IMU."""
-        state = self.state()
+    def predict(self, t_ns: int, index: int = -1) -> InertialState:
+        """Where the state of a frame, by default of the newest, leads to by the IMU."""
+        state = self.state(index)
         return self.preintegrator.predict(state, self._imu.between(state.t_ns, t_ns))
 
     def add(self, t_ns: int, xy: dict[int, F64], state: InertialState | None = None, still: bool = False) -> None:
