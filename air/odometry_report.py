@@ -9,7 +9,12 @@ import numpy as np
 
 from air.odometry.odometry import Odometry, Output
 from common.arrays import F64
+from common.export.trajectory import Trajectory
+from common.geo import T_world_other
 from common.messages import Datum, EstimatorState, Keyframe, Pose
+
+LEAST_SIGMA = 1e-3
+"""m; nothing is known better."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,19 @@ class OdometryReport:
     notes: list[tuple[float, str]]
     reprojection_rms_px: float
     statistics: dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How poses, one a second, compare with the truth: largest and root mean square of the error of position, m.
+
+    `nees` is the mean of its square in its own sigmas, 3 where these are right: axes count as independent.
+    """
+
+    poses: int
+    rmse: float
+    largest: float
+    nees: float
 
 
 @dataclass(eq=False)
@@ -70,6 +88,24 @@ class Told:
         self.last_ns = max(self.last_ns, message.t_ns)
         if not self.modes or self.modes[-1][1] != str(message.mode):
             self.modes.append((message.t_ns, str(message.mode)))
+
+    def compare(self, truth: Trajectory, datum: Datum) -> Consistency | None:
+        """The poses against a true trajectory of the body in the world of a datum; None where they share no time."""
+        if self.datum is None or not len(truth.t_ns):
+            return None
+        within = [p for p in self.poses if truth.t_ns[0] <= p.t_ns <= truth.t_ns[-1]]
+        if not within:
+            return None
+        seconds = np.array([pose.t_ns // 1_000_000_000 for pose in within])
+        poses = [within[i] for i in np.unique(seconds, return_index=True)[1]]
+        t_ns = np.array([pose.t_ns for pose in poses])
+        since_ns, true_ns = t_ns - truth.t_ns[0], truth.t_ns - truth.t_ns[0]
+        p_true = np.column_stack([np.interp(since_ns, true_ns, axis) for axis in truth.positions.T])
+        errors = T_world_other(datum, self.datum).apply(np.array([pose.T_world_body.t for pose in poses])) - p_true
+        sigmas = np.maximum(np.array([pose.sigma for pose in poses]), LEAST_SIGMA)
+        lengths = np.linalg.norm(errors, axis=1)
+        rmse, nees = float(np.sqrt(np.mean(lengths**2))), float(np.mean(np.sum((errors / sigmas) ** 2, axis=1)))
+        return Consistency(len(poses), rmse, float(lengths.max()), nees)
 
     def report(self, odometry: Odometry) -> OdometryReport:
         """All of it summed up."""

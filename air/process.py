@@ -12,19 +12,20 @@ from tqdm import tqdm
 from air.alignment.alignment import Alignment
 from air.config import AirConfig
 from air.mapping.mapper import Mapper
-from air.odometry_report import Told
+from air.odometry_report import Consistency, Told
 from air.preparation import prepared
 from air.report import Report, Stopwatch, counts, known_cells, peak_memory, problems_of
 from air.sources.navigated import Navigated
 from air.sources.source import PhotoSource, Source, open_photos
 from common.errors import ExportError, SourceError
+from common.export.datum import read_datum
 from common.export.products import write_products
-from common.export.trajectory import write_tum
+from common.export.trajectory import read_tum, write_tum
 from common.geo import T_world_other
 from common.messages import Datum, Keyframe, MapTile
 
 CHUNK = 10
-ODOMETRY = "odometry.tum"
+ODOMETRY, TRUTH = "odometry.tum", "truth"
 
 
 def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Report:
@@ -56,7 +57,7 @@ def process(config: AirConfig, url: str, out: Path, quiet: bool = False) -> Repo
     with watch.stage("export"):
         _write(out, source, alignment.datum, tiles, keyframes)
         _write_odometry(out, told, alignment.datum)
-    report = _report(source, alignment, tiles, told, config, watch)
+    report = _report(source, alignment, tiles, told, config, watch, out)
     report.write(out / "report.json")
     return report
 
@@ -91,7 +92,7 @@ def _map(keyframes: list[Keyframe], mapper: Mapper, alignment: Alignment, quiet:
 def _write(out: Path, source: PhotoSource, datum: Datum, tiles: list[MapTile], keyframes: list[Keyframe]) -> None:
     write_products(out, datum, tiles, keyframes)
     if source.truth is not None:
-        source.truth.write(out / "truth")
+        source.truth.write(out / TRUTH)
 
 
 def _write_odometry(out: Path, told: Told, datum: Datum) -> None:
@@ -101,13 +102,26 @@ def _write_odometry(out: Path, told: Told, datum: Datum) -> None:
         write_tum(out / ODOMETRY, [p.t_ns for p in told.poses], [T @ p.T_world_body for p in told.poses])
 
 
+def _against_truth(told: Told, out: Path) -> Consistency | None:
+    """The odometry against the truth that was written beside it; None where nothing was told."""
+    if not told.poses:
+        return None
+    return told.compare(read_tum(out / TRUTH / "trajectory.tum"), read_datum(out / TRUTH / "datum.json"))
+
+
 def _why(alignment: Alignment, source: PhotoSource) -> str:
     problems = problems_of(alignment.statuses(), source.problems)
     return "; ".join(f"{p['photo']}: {p['reason']}" for p in problems[:3]) + ("; …" if len(problems) > 3 else "")
 
 
 def _report(
-    source: PhotoSource, alignment: Alignment, tiles: list[MapTile], told: Told, config: AirConfig, watch: Stopwatch
+    source: PhotoSource,
+    alignment: Alignment,
+    tiles: list[MapTile],
+    told: Told,
+    config: AirConfig,
+    watch: Stopwatch,
+    out: Path,
 ) -> Report:
     cells = known_cells(tiles)
     odometry = source.navigator.odometry if isinstance(source, Navigated) and source.navigator else None
@@ -120,6 +134,7 @@ def _report(
         tiles=len(tiles),
         cells=cells,
         odometry=None if odometry is None else told.report(odometry),
+        odometry_against_truth=_against_truth(told, out) if source.truth is not None else None,
         area_m2=cells * config.mapping.cell**2,
         stages_s={name: round(s, 3) for name, s in watch.stages.items()},
         wall_s=round(watch.total, 3),

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from air.alignment.status import PhotoStatus, State
-from air.odometry_report import OdometryReport
+from air.odometry_report import Consistency, OdometryReport
 from air.sources.source import Problem
 from common.camera import CameraModel
 from common.messages import MapTile
@@ -45,7 +45,7 @@ class Stopwatch:
 class Report:
     """What `report.json` says; times in s, memory in bytes, lengths in px and m as named.
 
-    `odometry` is None for a source of photos.
+    `odometry` is None for a source of photos, `odometry_against_truth` for any but a simulated flight.
     """
 
     source: str
@@ -54,6 +54,7 @@ class Report:
     cameras: list[CameraModel]
     reprojection_rms_px: float
     odometry: OdometryReport | None
+    odometry_against_truth: Consistency | None
     tiles: int
     cells: int
     area_m2: float

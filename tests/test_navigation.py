@@ -26,11 +26,12 @@ from air.sources.known import Known
 from air.sources.simulated.motion.mission import FlightOptions
 from air.sources.source import Sensed
 from common.camera import CameraModel
+from common.export.trajectory import Trajectory
 from common.geo import T_ecef_enu, T_world_other, geodetic_to_enu
 from common.keys import parse_key
 from common.measurements import CameraFrame, Encoding, FixKind, ImuSample, ReceiverSolution, VehicleState
 from common.messages import Datum, Health, Level, Mode, Photo, Pose
-from common.se3 import rotation_angle
+from common.se3 import SE3, rotation_angle
 from common.streams import DATUM as DATUM_STREAM
 from common.streams import HEALTH, POSE, Stream
 from common.wire import decode
@@ -171,6 +172,22 @@ def test_what_was_told_is_summed_up(navigator: Navigator, told: list[Output | Ph
     assert max(report.modes_s, key=lambda mode: report.modes_s[mode]) == Mode.GNSS_INERTIAL
     assert sum(report.modes_s.values()) == pytest.approx(SECONDS - report.world_found_s, abs=1.0)
     assert report.statistics["satellites"]["median"] > 10
+
+
+def test_poses_are_as_good_as_they_say(flown: GnssFlight, told: list[Output | Photo]) -> None:
+    kept = Told()
+    for message in told:
+        if not isinstance(message, Photo):
+            kept.add(message)
+    t_ns = START_NS + np.arange(0, SECONDS * 20 - 20) * 50_000_000
+    motions = [flown.truth(int(t)) for t in t_ns]
+    truth = Trajectory(t_ns, tuple(SE3(R, p) for p, _, R in motions))
+    found = kept.compare(truth, DATUM)
+    assert found is not None
+    assert found.poses == pytest.approx(len(kept.poses) / 200, abs=3)
+    assert found.rmse <= found.largest < 8.0  # pseudoranges of the 1.5 m class
+    assert found.nees < 14.2  # χ² of three, once in 370: its errors hardly change during the flight
+    assert kept.compare(Trajectory(t_ns - 10**12, truth.poses), DATUM) is None
 
 
 # Live
