@@ -33,9 +33,7 @@ class UbloxReceiver:
     Without `baud` messages arrive whole, as over USB.
     """
 
-    def __init__(
-        self, device: str = "gnss", port: Port = Port.USB, rate_hz: int = 10, baud: int | None = None
-    ) -> None:
+    def __init__(self, device: str = "gnss", port: Port = Port.USB, rate_hz: int = 10, baud: int | None = None) -> None:
         self._device = device
         self._port = port
         self._rate_hz = rate_hz
