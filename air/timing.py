@@ -175,7 +175,7 @@ class ClockFilter:
         slope = _supporting_slope(list(self._buckets))
         settled = self._span >= SETTLED_S
         centre, reach = (0.0, MAX_DRIFT) if settled or self._known_drift is None else (self._known_drift, KNOWN_DRIFT)
-        self.drift = min(max(slope, centre - reach), centre + reach)
+        self.drift = min(max(slope, centre - reach, -MAX_DRIFT), centre + reach, MAX_DRIFT)
         if settled:
             self._known_drift = self.drift
         self._offset = min(y - self.drift * t for t, y in self._buckets)

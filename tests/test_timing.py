@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from clock_scene import HOST_NS, START_NS, Scene, run, solution
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from air.sensors.driver import TimeScale
@@ -127,6 +127,7 @@ def test_both_directions_of_a_clock_agree(host_ns: int, minutes: int) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(-(2**63), 2**63), st.integers(-(2**63), 2**63)), max_size=100))
+@example([(0, 0), (30_000_000_000, -13_920), (0, 53_499_986_080), (500_000_000, 0)])
 def test_any_times_are_survived_and_drift_stays_bounded(times: list[tuple[int, int]]) -> None:
     clock = ClockFilter()
     for device_ns, arrival_ns in times:
