@@ -61,6 +61,8 @@ class OdometryProcess:
             self._measurements.put_nowait((time.monotonic(), measurement))
         except queue.Full:
             self._drop()
+            if isinstance(measurement, CameraFrame):
+                self._room.release()
         if self._process.pid is None and isinstance(measurement, CameraFrame | ImuSample):
             self._listener.start()
             self._process.start()

@@ -125,7 +125,3 @@ def errors(flown: GnssFlight, poses: list[Estimate], datum: Datum) -> tuple[F64,
         in_body = T.R.T @ error
         squares.append(in_body @ np.linalg.solve(pose.covariance[3:6, 3:6], in_body))
     return np.array(off), np.array(squares)
-
-
-def is_rover(message: object) -> bool:
-    return isinstance(message, GnssEpoch) and message.receiver == "gnss"

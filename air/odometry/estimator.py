@@ -146,7 +146,8 @@ class Estimator:
         if not self.gnss.couple(window, epoch):
             return None
         solution = window.settle()
-        self._fix(window)
+        if self.gnss.fix(window):
+            solution = window.settle()
         self.revision += 1
         self._monitor.found_gnss()
         self._propagate_from(window.state())
@@ -276,9 +277,7 @@ class Estimator:
     ) -> dict[int, F64]:
         """What a frame sees, moved from the times of its rows to its own."""
         pieces = self.buffer.between(frame.t_ns - HALF_GYRO_NS, frame.t_ns + HALF_GYRO_NS)
-        omega = np.zeros(3)
-        if len(pieces.dt_s):
-            omega = pieces.dt_s @ pieces.gyro / pieces.dt_s.sum() - state.gyro_bias
+        omega = pieces.rate - state.gyro_bias
         v_body = state.T_world_body.R.T @ state.v_world + np.cross(omega, self._T_body_cam.t)
         R = self._T_body_cam.R.T
         return ideal_points(frame, self._focal, R @ omega, R @ v_body, depths, usual)

@@ -10,7 +10,7 @@ from air.gnss.gnss_time import SECOND_NS
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
 from air.odometry.gnss_settings import GnssSettings
 from air.odometry.gnss_start import GnssStart
-from air.odometry.gnss_window import GnssWindow
+from air.odometry.gnss_window import GYRO_NS, GnssWindow
 from air.odometry.gnss_world import WorldSearch
 from air.odometry.preintegration import ImuBuffer, InertialState
 from air.odometry.window import Window
@@ -21,7 +21,6 @@ from common.messages import Datum
 
 WAITING = 50
 """Epochs that wait for the IMU; older ones are given up."""
-GYRO_NS = 20_000_000
 SIGMA_CYCLES = 0.05
 """Below it carriers of whole cycles place the aircraft, m; codes add nothing."""
 
@@ -129,7 +128,6 @@ class GnssCoupling:
 
     def _antenna(self, state: InertialState) -> tuple[F64, F64]:
         """Position (3,) m and velocity (3,) m/s of the antenna in world."""
-        pieces = self._imu.between(state.t_ns - GYRO_NS, state.t_ns)
-        omega = pieces.dt_s @ pieces.gyro / pieces.dt_s.sum() - state.gyro_bias if len(pieces.dt_s) else np.zeros(3)
+        omega = self._imu.between(state.t_ns - GYRO_NS, state.t_ns).rate - state.gyro_bias
         T = state.T_world_body
         return T.apply(self._lever), state.v_world + T.R @ np.cross(omega, self._lever)

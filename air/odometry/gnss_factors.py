@@ -42,14 +42,13 @@ class AntennaMotion:
 class Linearised:
     """Rows of one or more epochs, as ½ (f − 2 gᵀδ + δᵀ G δ) of a keyframe's 15 columns and a node's D columns.
 
-    `rows` were used; `chi_square` is what they left of their own noise before they were weighted down.
+    `rows` were used.
     """
 
     G: F64
     g: F64
     f: float
     rows: int
-    chi_square: float
 
 
 def antenna_motion(
@@ -145,7 +144,6 @@ def total(parts: Sequence[Linearised]) -> Linearised:
         g=np.sum([part.g for part in parts], axis=0),
         f=sum(part.f for part in parts),
         rows=sum(part.rows for part in parts),
-        chi_square=sum(part.chi_square for part in parts),
     )
 
 
@@ -165,14 +163,14 @@ def _eliminated(H: F64, r: F64, sigma: F64, robust: float) -> Linearised:
     """Rows with one unknown that all share, their clock, which is eliminated."""
     width = H.shape[1]
     if len(r) < 2:
-        return Linearised(np.zeros((width, width)), np.zeros(width), 0.0, 0, 0.0)
+        return Linearised(np.zeros((width, width)), np.zeros(width), 0.0, 0)
     off = r - _weighted_median(r, 1 / sigma**2)
     scaled = np.abs(off) / sigma
     weight = np.minimum(1.0, robust / np.maximum(scaled, 1e-9)) / sigma**2
     mean_H, mean_r = weight @ H / weight.sum(), weight @ r / weight.sum()
     H, r = H - mean_H, r - mean_r
     WH = weight[:, None] * H
-    return Linearised(H.T @ WH, WH.T @ r, float(weight @ r**2), len(r), float(np.sum(scaled**2)))
+    return Linearised(H.T @ WH, WH.T @ r, float(weight @ r**2), len(r))
 
 
 def _weighted_median(values: F64, weight: F64) -> float:

@@ -21,7 +21,7 @@ from air.odometry.gnss_factors import antenna_motion, linearise, total
 from air.odometry.gnss_fixing import fix
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssSettings
-from air.odometry.preintegration import ImuBuffer
+from air.odometry.preintegration import ImuBuffer, ImuPieces
 from air.odometry.quadratic import Quadratic, variable
 from air.odometry.window import Frame, Window
 from common.arrays import F64
@@ -82,12 +82,15 @@ class GnssWindow:
     def add(self, window: Window, epoch: CleanEpoch) -> bool:
         """Take an epoch that IMU samples cover; whether a keyframe lies before it, and the IMU tells the way there."""
         keyframe = _before(window.frames, epoch.t_ns)
-        if keyframe is None or self._imu.between(keyframe.t_ns, epoch.t_ns).doubtful.any():
+        if keyframe is None:
+            return False
+        way = self._imu.between(keyframe.t_ns, epoch.t_ns)
+        if way.doubtful.any():
             return False
         if not self._differential:
             epoch = self._renewed(epoch)
         stretch = self._stretch(window.values, keyframe.k, epoch)
-        taken = self._taken(window, keyframe, epoch)
+        taken = self._taken(window, keyframe, epoch, way)
         stretch.taken.append(taken)
         own = self._linearised(window.values, stretch, [taken])
         stretch.known = own if stretch.known is None else _sum(stretch.known.at(window.values), own)
@@ -176,14 +179,13 @@ class GnssWindow:
             self._lines = {arc: one for arc, one in self._lines.items() if one[0] >= oldest_ns}
         return line
 
-    def _taken(self, window: Window, keyframe: Frame, epoch: CleanEpoch) -> _Taken:
+    def _taken(self, window: Window, keyframe: Frame, epoch: CleanEpoch, way: ImuPieces) -> _Taken:
         bias = window.values.atConstantBias(B(keyframe.k))
-        measured = window.preintegrator.integrate(self._imu.between(keyframe.t_ns, epoch.t_ns), bias)
-        pieces = self._imu.between(epoch.t_ns - GYRO_NS, epoch.t_ns)
-        omega = pieces.dt_s @ pieces.gyro / pieces.dt_s.sum() if len(pieces.dt_s) else np.zeros(3)
+        measured = window.preintegrator.integrate(way, bias)
+        omega = self._imu.between(epoch.t_ns - GYRO_NS, epoch.t_ns).rate
         p_world = window.values.atPose3(X(keyframe.k)).translation()
         line = None if self._differential else self._line_carrier(epoch, p_world)
-        return _Taken(epoch, measured, np.asarray(omega), line)
+        return _Taken(epoch, measured, omega, line)
 
     def _linearised(self, values: gtsam.Values, stretch: _Stretch, taken: Sequence[_Taken]) -> Quadratic:
         k, node = stretch.k, stretch.node

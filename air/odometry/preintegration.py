@@ -50,6 +50,11 @@ class ImuPieces:
     gyro: F64
     doubtful: Bool
 
+    @property
+    def rate(self) -> F64:
+        """Mean rate of turn (3,) rad/s, as measured; zero over no time."""
+        return np.asarray(self.dt_s @ self.gyro / self.dt_s.sum()) if len(self.dt_s) else np.zeros(3)
+
     def turn(self, gyro_bias: F64) -> F64:
         """`R_begin_end` (3, 3), how the body turned over all pieces."""
         R = gtsam.Rot3()
