@@ -8,8 +8,11 @@ sampling (mid-exposure for an image). Arrays are read-only by convention: whoeve
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+
+import numpy as np
 
 from common.arrays import F32, F64, I32, U8, Bool
 from common.camera import CameraModel
@@ -100,6 +103,10 @@ class Keyframe:
     thumbnail: bytes
 
 
+def _unknown() -> F64:
+    return np.full(3, np.nan)
+
+
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
     """What the odometry believes besides the pose.
@@ -107,6 +114,12 @@ class EstimatorState:
     `accel_bias` (3,) m/s² and `gyro_bias` (3,) rad/s; `T_body_cam` and `time_offset_s` (IMU time minus frame time) as
     calibrated or estimated; how many `points` and `satellites` are in use, and the root mean square of the reprojection
     errors.
+
+    NaN is what is unknown of the rest. `clock_s` is the receiver's clock minus GPST by satellite system (RINEX letter),
+    and `clock_drift` how fast it grows, s/s; `lever_arm` (3,) m is the antenna in body. `code_rms_m`, `doppler_rms_mps`
+    and `carrier_rms_m` are the root mean squares of the residuals of what is in use. One sigma is known of the
+    extrinsics: `rotation_sigma` (3,) rad and `translation_sigma` (3,) m of the camera, both in its axes,
+    `time_offset_sigma_s`, `lever_arm_sigma` (3,) m.
     """
 
     flight: str
@@ -120,6 +133,16 @@ class EstimatorState:
     points: int
     satellites: int
     reprojection_rms_px: float
+    clock_s: dict[str, float] = field(default_factory=dict)
+    clock_drift: float = math.nan
+    lever_arm: F64 = field(default_factory=_unknown)
+    code_rms_m: float = math.nan
+    doppler_rms_mps: float = math.nan
+    carrier_rms_m: float = math.nan
+    rotation_sigma: F64 = field(default_factory=_unknown)
+    translation_sigma: F64 = field(default_factory=_unknown)
+    time_offset_sigma_s: float = math.nan
+    lever_arm_sigma: F64 = field(default_factory=_unknown)
 
 
 @dataclass(frozen=True, order=True)

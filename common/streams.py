@@ -70,7 +70,7 @@ DATUM = Stream("datum", Datum, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.B
 HEALTH = Stream("health", Health, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 5.0, keyed=True)
 DIGEST = Stream("map/digest", MapDigest, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 256_000, 5.0)
 KEYFRAME = Stream("keyframe", Keyframe, 0.0, Priority.DATA, Congestion.BLOCK, Radio.VIDEO, 64_000, 0.0, keyed=True)
-ESTIMATOR = Stream("estimator", EstimatorState, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 1_000, 5.0)
+ESTIMATOR = Stream("estimator", EstimatorState, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 2_000, 5.0)
 TILE = Stream("map/tile", MapTile, 0.0, Priority.DATA_LOW, Congestion.BLOCK, Radio.VIDEO, 256_000, 0.0, keyed=True)
 TILE_REQUEST = Stream("cmd/tiles", TileRequest, 0.0, Priority.DATA_HIGH, Congestion.BLOCK, Radio.BOTH, 64_000, 0.0)
 

@@ -37,9 +37,12 @@ class Codec:
 
 
 def record_codec(kind: type[Any], schema: Schema) -> tuple[Callable[[Any], Fields], Callable[[Fields], Any]]:
-    """How a dataclass becomes a map, and back. Raises TypeError for a field that has no form on the wire."""
+    """How a dataclass becomes a map, and back. Raises TypeError for a field that has no form on the wire.
+
+    A field that the schema does not require is left out where it is unknown, and then has its default.
+    """
     hints, names = get_type_hints(kind), [f.name for f in fields(kind)]
-    properties = schema["properties"]
+    properties, required = schema["properties"], set(schema["required"])
     codecs = [_field_codec(name, hints[name], properties[name]) for name in names]
     packers = [(name, codec.pack) for name, codec in zip(names, codecs, strict=True)]
     unpackers = [(name, codec.unpack) for name, codec in zip(names, codecs, strict=True)]
@@ -49,10 +52,12 @@ def record_codec(kind: type[Any], schema: Schema) -> tuple[Callable[[Any], Field
     def pack(record: Any) -> Fields:
         check_rows(record)
         pairs = zip(packers, values_of(record), strict=True)
-        return {name: value if convert is None else convert(value) for (name, convert), value in pairs}
+        values = {name: value if convert is None else convert(value) for (name, convert), value in pairs}
+        return {name: value for name, value in values.items() if name in required or not _is_unknown(value)}
 
     def unpack(f: Fields) -> Any:
-        record = kind(*[f[name] if convert is None else convert(f[name]) for name, convert in unpackers])
+        known = [(name, convert) for name, convert in unpackers if name in f]
+        record = kind(**{name: f[name] if convert is None else convert(f[name]) for name, convert in known})
         check_rows(record)
         return record
 
@@ -62,6 +67,11 @@ def record_codec(kind: type[Any], schema: Schema) -> tuple[Callable[[Any], Field
 def describe(value: Any) -> str:
     """The type of a value, and the shape of an array, for error messages."""
     return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+
+
+def _is_unknown(value: Any) -> bool:
+    """Whether a value on the wire says nothing."""
+    return value is None or value == {} or (isinstance(value, list) and all(x is None for x in value))
 
 
 def _rows_check(names: list[str]) -> Callable[[Any], None]:

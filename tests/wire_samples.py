@@ -252,6 +252,7 @@ _name = st.text(st.characters(codec="utf-8"), min_size=1, max_size=20)
 _issue = st.integers(0, 65535)
 _satellite = st.builds("{}{:02d}".format, st.sampled_from("GREC"), st.integers(1, 63))
 _unknown_sigma = st.floats(0.0, 1e6) | st.just(math.nan)
+_sigmas = st.tuples(*[_unknown_sigma] * 3).map(np.array)
 _quaternion = _se3.map(lambda T: T.wxyz)
 
 
@@ -298,6 +299,9 @@ STRATEGIES: dict[type[Any], st.SearchStrategy[Any]] = {
         EstimatorState,
         *(_flight, _t_ns, _count, st.sampled_from(Mode), _vectors(1e3), _vectors(1e3)),
         *(_se3, _floats(10.0), _count, _count, st.floats(0.0, 1e3)),
+        *(st.dictionaries(st.sampled_from("GREC"), _floats(1.0)), _unknown(1.0), _known_or_not(3)),
+        *([_unknown_sigma] * 3),
+        *(_sigmas, _sigmas, _unknown_sigma, _sigmas),
     ),
     Keyframe: st.builds(
         Keyframe,
@@ -315,11 +319,7 @@ STRATEGIES: dict[type[Any], st.SearchStrategy[Any]] = {
     MapDigest: st.builds(MapDigest, _flight, _t_ns, _rows(4)),
     TileRequest: st.builds(TileRequest, _flight, _rows(3)),
     Health: st.builds(
-        Health,
-        _t_ns,
-        st.text(st.characters(codec="utf-8"), min_size=1, max_size=20),
-        st.sampled_from(Level),
-        _text,
+        *(Health, _t_ns, _name, st.sampled_from(Level), _text),
         st.dictionaries(_text, st.integers(-(2**63), 2**63 - 1), max_size=5),
     ),
     RawBytes: st.builds(RawBytes, _t_ns, _name, st.binary(max_size=50)),
