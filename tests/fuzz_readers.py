@@ -31,7 +31,7 @@ from air.gnss.precise_orbit import read_sp3
 from air.gnss.rinex_lines import Lines
 from air.gnss.rinex_navigation import read_navigation
 from air.gnss.rinex_observation import read_observations
-from air.sensors import rtcm, ubx, xbus
+from air.sensors import ubx, xbus
 from air.sensors.driver import Driver
 from air.sensors.gnss_ublox import UbloxReceiver
 from air.sensors.imu_xsens import XsensImu
@@ -40,6 +40,7 @@ from air.sensors.mtdata2 import DataId, Precision, pack
 from air.sensors.ubx_messages import NAV_PVT, RXM_RAWX, RXM_SFRBX, NavigationBits, pack_sfrbx
 from air.sensors.ubx_pvt import pack_pvt
 from air.sensors.ubx_rawx import pack_rawx
+from common import rtcm
 from common.errors import SourceError
 from common.mavlink import Stamps
 from common.recording.reader import MAX_PROBLEMS, Recording

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from ubx_samples import EPOCH, FRAMES, STREAM, epochs, solutions
 
 from air.gnss.gnss_time import GPS_EPOCH_NS, SECOND_NS, WEEK_NS
-from air.sensors import rtcm, ubx
+from air.sensors import ubx
 from air.sensors.gnss_ublox import UbloxReceiver
 from air.sensors.ublox_settings import Port
 from air.sensors.ublox_settings import settings as receiver_settings
@@ -28,6 +28,7 @@ from air.sensors.ubx_pvt import pack_pvt, parse_pvt
 from air.sensors.ubx_rawx import pack_rawx, parse_rawx
 from air.sources.device_file import DeviceFile
 from air.sources.source import open_source
+from common import rtcm
 from common.errors import SourceError
 from common.measurements import FixKind, GnssEpoch, Measurement, ReceiverSolution
 

@@ -12,7 +12,7 @@ from bus_network import client_of, collect
 from device_aircraft import Aircraft
 from device_ports import wait_for
 
-from air.sensors import rtcm
+from common import rtcm
 from common.keys import all_of, stream_key
 from common.measurements import ClockPhase, ClockState, ImuSample, RawBytes, ReceiverSolution
 from common.messages import Health, Level

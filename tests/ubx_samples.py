@@ -9,11 +9,12 @@ import numpy as np
 from hypothesis import strategies as st
 
 from air.gnss.gnss_time import from_week
-from air.sensors import rtcm, ubx
+from air.sensors import ubx
 from air.sensors.ubx_messages import NAV_PVT, RXM_RAWX
 from air.sensors.ubx_pvt import pack_pvt
 from air.sensors.ubx_rawx import pack_rawx
 from air.sensors.ubx_signals import SATELLITE_NAMES, SIGNAL_NAMES, signal_id
+from common import rtcm
 from common.measurements import FixKind, GnssEpoch, ReceiverSolution
 
 EPOCH = GnssEpoch(

@@ -9,9 +9,9 @@ import math
 from collections.abc import Sequence
 
 from air.gnss.bits import SEMICIRCLE, Layout, bits_of, joined, signed, split, unsigned
-from air.gnss.crc24q import crc24q
 from air.gnss.gnss_time import WEEK_NS, from_week, nearest, to_week
 from air.gnss.lnav import ORBIT_AND_CLOCK
+from common.crc24q import crc24q
 from common.measurements import KeplerEphemeris
 
 WORD_BITS = 128

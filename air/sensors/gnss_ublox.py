@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from air.gnss.navigation_message import NavigationMessages
-from air.sensors import rtcm, ubx
+from air.sensors import ubx
 from air.sensors.driver import Counts, TimeScale
-from air.sensors.framing import FrameScanner
 from air.sensors.ublox_settings import Port, settings_frame
 from air.sensors.ubx_messages import ACK_ACK, ACK_NAK, CFG_VALSET, NAV_PVT, RXM_RAWX, RXM_SFRBX, parse_sfrbx
 from air.sensors.ubx_pvt import parse_pvt
 from air.sensors.ubx_rawx import parse_rawx
+from common import rtcm
 from common.clock import GPST_MINUS_UTC_NS
+from common.framing import FrameScanner
 from common.measurements import GnssEpoch, Measurement, ReceiverSolution
 
 _NMEA, _UBX = b"$"[0], ubx.SYNC[0]

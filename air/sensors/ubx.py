@@ -10,7 +10,7 @@ import re
 import numpy as np
 from pyubx2 import UBX_MSGIDS
 
-from air.sensors.framing import UNFINISHED
+from common.framing import UNFINISHED
 
 SYNC = b"\xb5\x62"
 _HEADER, _CHECKSUM = 6, 2

@@ -16,13 +16,13 @@ from air.devices.settings import DevicesConfig, PortConfig
 from air.devices.status import DeviceStatus
 from air.sensors.calibration import Calibration
 from air.sensors.driver import Driver, TimeScale
-from air.sensors.rtcm import RtcmFilter
 from air.sources.known import Known
 from air.sources.source import Problem, Truth
 from air.timing import Timebase
 from common.clock import Clock, SystemClock
 from common.errors import SourceError
 from common.measurements import FixKind, Measurement, RawBytes, ReceiverSolution
+from common.rtcm import RtcmFilter
 
 QUEUE = 2000
 """Arrivals that may wait: more are dropped, for whoever reads is too slow, and memory is finite."""

@@ -5,9 +5,9 @@ Source: RTCM 10403.3, section 4 (transport layer).
 
 from __future__ import annotations
 
-from air.gnss.crc24q import crc24q
-from air.sensors.driver import Counts
-from air.sensors.framing import UNFINISHED, FrameScanner
+from common.counts import Counts
+from common.crc24q import crc24q
+from common.framing import UNFINISHED, FrameScanner
 
 PREAMBLE = 0xD3
 _HEADER, _CRC = 3, 3

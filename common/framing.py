@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 
-from air.sensors.driver import Counts
+from common.counts import Counts
 
 UNFINISHED = -1
 """What a probe says of a frame that may be valid once more bytes have come."""
