@@ -43,14 +43,15 @@ from common.geo import geodetic_to_enu
 from common.measurements import ReceiverSolution
 
 SEEDS = (1, 2, 3)
-DURATION_S = 1200.0
-OWN_SEEDS, OWN_S = (1, 2, 3, 4, 5), 240.0
+RTK_S = 600.0
+MANY_SEEDS, SINGLE_S, SINGLE_STEP_S = range(1, 17), 600.0, 10.0
+OWN_SEEDS, OWN_S = range(1, 13), 60.0
 PERFECT, DEFAULT = GnssOptions.perfect(), GnssOptions()
 ALONE = {
     "none": (),
     "multipath of the code": ("multipath",),
-    "ionosphere's residual": ("ionosphere_residual",),
-    "troposphere's residual": ("troposphere_residual",),
+    "ionosphere beyond the model": ("ionosphere_residual", "ionosphere_gradient", "ionosphere_ripples"),
+    "troposphere beyond the model": ("troposphere_residual",),
     "orbits and satellite clocks": ("orbit", "satellite_clock"),
     "noise of the code": ("code",),
     "all": tuple(field.name for field in fields(GnssOptions)),
@@ -110,10 +111,12 @@ def single_points(folder):
     print("\n| errors that are on | horizontal RMS, m | vertical RMS, m | correlated over, s | positions | ours, m |")
     print("|---|---|---|---|---|---|")
     for name, on in tqdm(ALONE.items(), leave=False, disable=None):
-        options = replace(PERFECT, **{key: getattr(DEFAULT, key) for key in on} | {"rate_hz": 0.5, "missing": 0.0})
+        options = replace(
+            PERFECT, **{key: getattr(DEFAULT, key) for key in on} | {"rate_hz": 1 / SINGLE_STEP_S, "missing": 0.0}
+        )
         errors, ours, epochs = [], [], 0
-        for seed in SEEDS:
-            flight = exported(folder, options, None, DURATION_S, seed)
+        for seed in MANY_SEEDS:
+            flight = exported(folder, options, None, SINGLE_S, seed)
             known = Ephemerides(open_rinex(f"rinex:{flight.nav}", str(flight.nav)))
             fixes = [find_position(o.epoch, known, PositioningSettings()) for o in flight.observed]
             fixes = [fix for fix in fixes if isinstance(fix, PointPosition)]
@@ -124,7 +127,7 @@ def single_points(folder):
             epochs += len(flight.observed)
         rms = np.sqrt(np.mean(np.square(np.concatenate(errors)), axis=0))
         own = np.sqrt(np.mean(np.square(np.concatenate(ours)), axis=0))
-        seconds = np.median([correlation_time(e[:, axis], 2.0) for e in errors for axis in range(3)])
+        seconds = np.median([correlation_time(e[:, axis], SINGLE_STEP_S) for e in errors for axis in range(3)])
         given = sum(map(len, errors)) / epochs
         cells = f"{np.hypot(*rms[:2]):.2f} | {rms[2]:.2f} | {seconds:.0f} | {given:.1%}"
         print(f"| {name} | {cells} | {np.hypot(*own[:2]):.2f}, {own[2]:.2f} |", flush=True)
@@ -145,7 +148,7 @@ def carrier_phases(folder):
         errors, epochs = [], 0
         for seed in SEEDS:
             flying, standing = replace(options, rate_hz=1.0, missing=0.0), replace(ground, rate_hz=1.0)
-            flight = exported(folder, flying, standing, DURATION_S / 2, seed, antenna)
+            flight = exported(folder, flying, standing, RTK_S, seed, antenna)
             found = rtklib.kinematic(folder, flight.rover, flight.base, flight.nav, BASE_ECEF)
             fixed = [s for s in found if s.fixed]
             offset = flight.errors((s.t_ns for s in fixed), (s.position for s in fixed))

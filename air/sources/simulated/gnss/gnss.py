@@ -26,7 +26,7 @@ from common.measurements import GnssEpoch
 
 ROVER, BASE_STATION = 54, 61
 """First part numbers of the random streams of the two receivers."""
-_PROCESSING_S, _SOLVING_S = 0.03, 0.01
+PROCESSING_S, _SOLVING_S = 0.03, 0.01
 """From the epoch to its raw measurements, and from these to the solution."""
 _RESET_S = 1e-3
 _WARM_HZ = 0.1
@@ -108,7 +108,7 @@ class SimulatedReceiver:
             own.hear(piece.bits, piece.end_ns)
             yield self._since_start(piece.end_ns), ubx.frame(RXM_SFRBX, pack_sfrbx(piece.bits))
         for observed in second:
-            ready_s = observed.t_s + _PROCESSING_S
+            ready_s = observed.t_s + PROCESSING_S
             yield ready_s, ubx.frame(RXM_RAWX, observed.payload)
             solution = own.solve(observed.epoch)
             yield ready_s + _SOLVING_S, ubx.frame(NAV_PVT, pack_pvt(solution, self._sky.constellation.leap_s))

@@ -19,8 +19,10 @@ from air.gnss.ranges import group_delay
 from air.gnss.signals import LIGHT, frequency
 from air.sources.simulated.gnss.constellation import Constellation
 from air.sources.simulated.gnss.gnss_options import GnssOptions
+from air.sources.simulated.gnss.ionosphere import IonosphereError
+from air.sources.simulated.gnss.swing import Swing
 from common.arrays import F64
-from common.geo import ecef_to_geodetic, geodetic_to_ecef
+from common.geo import T_ecef_enu, ecef_to_geodetic, geodetic_to_ecef
 from common.measurements import GlonassEphemeris
 from common.messages import Datum
 
@@ -31,6 +33,9 @@ _LAST_BEIDOU_2 = 16
 _NODE_S, _NODES_KEPT = 10.0, 8
 _LOWEST = np.radians(5.0)
 """Below this, delays in the air are those of this elevation: the models know no horizon."""
+_ERROR_OF = {"G": 1.0, "E": 0.35, "C": 1.6, "R": 3.0}
+"""How large orbits' and clocks' errors of a system are against GPS's (Montenbruck, Steigenberger and Hauschild,
+Multi-GNSS signal-in-space range error assessment, 2018: 0.6 m, Galileo 0.2 m, BeiDou-2 1 m, GLONASS 2 m)."""
 _FAULT_ELEVATION = np.radians(25.0)
 
 
@@ -68,10 +73,11 @@ class Sky:
         self.options = options
         n = len(self.satellites)
         rng = np.random.default_rng([seed, _ERRORS])
-        self._orbit_error = _Swing(rng, (n, 3), options.orbit, 7200.0, 21_600.0)
-        self._clock_error = _Swing(rng, (n,), options.satellite_clock, 3600.0, 10_800.0)
-        self._ionosphere_error = _Swing(rng, (n,), options.ionosphere_residual, 1200.0, 3600.0)
-        self._troposphere_error = _Swing(rng, (1,), options.troposphere_residual, 3600.0, 10_800.0)
+        share = np.array([_ERROR_OF[name[0]] for name in self.satellites])
+        self._orbit_error = Swing(rng, (n, 3), options.orbit * share[:, None], 10_800.0, 21_600.0)
+        self._clock_error = Swing(rng, (n,), options.satellite_clock * share, 10_800.0, 21_600.0)
+        self._ionosphere_error = IonosphereError(options, n, rng)
+        self._troposphere_error = Swing(rng, (1,), options.troposphere_residual, 3600.0, 10_800.0)
         self._nodes: OrderedDict[int, tuple[F64, F64, F64]] = OrderedDict()
         self.channel = np.array([getattr(r, "channel", 0) for r in constellation.reference], np.int32)
         self.signals = tuple(SIGNALS[name[0]] for name in self.satellites)
@@ -125,10 +131,16 @@ class Sky:
             direction=np.stack(
                 [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1
             ),
-            ionosphere=self.options.ionosphere * delay + slant * self._ionosphere_error.at(np.array(t_s)),
+            ionosphere=self.options.ionosphere * delay
+            + slant * self._ionosphere_error.at(t_s, self._apart(position), azimuth, angle),
             troposphere=self.options.troposphere * wet_and_dry
             + self._troposphere_error.at(np.array(t_s)) / np.sin(angle),
         )
+
+    def _apart(self, position: F64) -> F64:
+        """How far north and east (2,) km of the flight's start a place (3,) m lies, ECEF."""
+        east, north, _ = T_ecef_enu(self.datum).inverse().apply(position)
+        return np.array([north, east]) / 1000.0
 
     def _satellites(self, t_s: F64) -> tuple[F64, F64, F64, F64, F64]:
         """Position, velocity, acceleration (N, S, 3) in ECEF, clock (N, S) s and its rate at times (N,), errors
@@ -162,23 +174,6 @@ class Sky:
             while len(self._nodes) > _NODES_KEPT:
                 self._nodes.popitem(last=False)
         return self._nodes[k]
-
-
-class _Swing:
-    """An error that swings slowly as a sine, with random period and phase, and `size` as its standard deviation."""
-
-    def __init__(
-        self, rng: np.random.Generator, shape: tuple[int, ...], size: float, shortest_s: float, longest_s: float
-    ):
-        self._omega = 2 * np.pi / rng.uniform(shortest_s, longest_s, shape)
-        self._phase = rng.uniform(0.0, 2 * np.pi, shape)
-        self._size = size * np.sqrt(2.0)
-
-    def at(self, t_s: F64) -> F64:
-        return np.asarray(self._size * np.sin(np.multiply.outer(t_s, self._omega) + self._phase))
-
-    def rate(self, t_s: F64) -> F64:
-        return np.asarray(self._size * self._omega * np.cos(np.multiply.outer(t_s, self._omega) + self._phase))
 
 
 def l1_squared_over(frequency: F64) -> F64:
