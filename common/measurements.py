@@ -79,7 +79,8 @@ class GnssEpoch:
     satellite comes closer; `cn0` dBHz; `lock_s` s of unbroken carrier tracking; `half_cycle`, true where the phase
     may be off by half a cycle; `sigma_*`, the receiver's own one-sigma in the unit of the measurement; `channel`,
     the GLONASS frequency number (0 for others). `leap_s` is GPST minus UTC in s, None when unknown. `clock_reset`
-    says that the receiver's clock jumped since the epoch before.
+    says that the receiver's clock jumped since the epoch before. `p_ecef` (3,) m is where the antenna of a base stands,
+    as far as the base says so.
     """
 
     t_ns: int
@@ -98,6 +99,7 @@ class GnssEpoch:
     channel: I32
     leap_s: int | None = None
     clock_reset: bool = False
+    p_ecef: F64 | None = None
 
 
 @dataclass(frozen=True)

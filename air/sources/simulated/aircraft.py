@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from air.sensors.driver import Driver
+from air.sensors.gnss_rtcm import RtcmReceiver
 from air.sensors.gnss_ublox import UbloxReceiver
 from air.sensors.imu_xsens import XsensImu
 from air.sensors.mavlink import MavlinkVehicle
@@ -22,6 +23,7 @@ from air.sources.simulated.camera.video import SimulatedCamera, draw_lens
 from air.sources.simulated.clocks import Device, DeviceClock, TransportDelay
 from air.sources.simulated.extrinsics import draw_extrinsics
 from air.sources.simulated.gnss.antenna import carried_antenna, fixed_antenna
+from air.sources.simulated.gnss.base import SimulatedBase
 from air.sources.simulated.gnss.constellation import constellation
 from air.sources.simulated.gnss.gnss import BASE_STATION, SimulatedReceiver
 from air.sources.simulated.gnss.sky import Sky
@@ -144,7 +146,7 @@ class Aircraft:
         drivers = (
             XsensImu("imu"),
             UbloxReceiver("gnss", baud=options.gnss.baud),
-            UbloxReceiver("base", baud=options.base.baud),
+            RtcmReceiver("base", near_ns=self.start_ns),
             MavlinkVehicle("mavlink"),
         )
         return {driver.device: driver for driver in drivers if driver.device not in options.off}
@@ -159,7 +161,7 @@ class Aircraft:
         makers: dict[str, Callable[[], _Sender]] = {
             "imu": self.imu,
             "gnss": self.receiver,
-            "base": self.base,
+            "base": lambda: SimulatedBase(self.base(), self.p_base_ecef),
             "mavlink": self.telemetry,
         }
         return makers[device]().packets()
