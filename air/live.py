@@ -10,6 +10,7 @@ from air.alignment.alignment import Alignment
 from air.alignment.prepare import PreparedPhoto
 from air.alignment.status import State
 from air.config import AirConfig
+from air.jump import Jump
 from air.mapping.mapper import Mapper
 from air.report import counts, problems_of
 from air.sources.source import Problem
@@ -61,6 +62,10 @@ class LiveMap:
             self._mapper.add_image(self._photos, photo.image)
         self._photos += 1
         return keyframes
+
+    def move(self, jump: Jump) -> list[Keyframe]:
+        """The keyframes that move along with the odometry's world."""
+        return self._alignment.move(jump)
 
     def grow(self, keyframes: list[Keyframe]) -> Growth:
         """What these keyframes add to the map, and the poses of the new ones; what they move is left for later."""

@@ -14,6 +14,7 @@ from multiprocessing.queues import Queue
 from typing import Any
 
 from air.config import AirConfig
+from air.jump import Jump
 from air.sources.source import Problem, Truth
 from common.messages import Datum, Photo
 
@@ -31,22 +32,26 @@ class MappingProcess:
     def __init__(self, config: AirConfig, flight: str) -> None:
         self._config, self._flight = config, flight
         self._context = multiprocessing.get_context("spawn")
-        self._photos: Queue[Photo | None] = self._context.Queue(WAITING)
+        self._photos: Queue[Photo | Jump | None] = self._context.Queue()
         self._records: Queue[Any] = self._context.Queue()
         self._process: SpawnProcess | None = None
         self._listener = QueueListener(self._records, *logging.getLogger().handlers)
 
-    def take(self, photo: Photo, datum: Datum) -> None:
-        """Hand a photo to the mapper, unless too many wait there. The datum that came first stays."""
+    def take(self, photo: Photo | Jump, datum: Datum) -> None:
+        """Hand a photo to the mapper, unless too many wait there, or a jump. The datum that came first stays."""
+        if isinstance(photo, Jump):
+            if self._process is not None:
+                self._photos.put(photo)
+            return
         if self._process is None:
             given = (self._config, self._flight, datum, self._photos, self._records)
             self._process = self._context.Process(target=_map, args=given, name="mapping")
             self._listener.start()
             self._process.start()
-        try:
-            self._photos.put_nowait(photo)
-        except queue.Full:
+        if self._photos.qsize() >= WAITING:
             log.warning("%s is not mapped: the mapper is behind by %d photos", photo.name, WAITING)
+        else:
+            self._photos.put(photo)
 
     def finish(self) -> None:
         """No more photos come: the mapper adjusts all of them once more, and stays for those who ask."""
@@ -68,13 +73,13 @@ class MappingProcess:
 class Taken:
     """Photos that another process takes, until it sends None. `check_stop` raises when they are not wanted any more."""
 
-    photos: Queue[Photo | None]
+    photos: Queue[Photo | Jump | None]
     check_stop: Callable[[], None]
     url: str = "live:"
     truth: Truth | None = None
     problems: Sequence[Problem] = ()
 
-    def __iter__(self) -> Iterator[Photo]:
+    def __iter__(self) -> Iterator[Photo | Jump]:
         while True:
             self.check_stop()
             try:
@@ -86,7 +91,7 @@ class Taken:
             yield photo
 
 
-def _map(config: AirConfig, flight: str, datum: Datum, photos: Queue[Photo | None], records: Queue[Any]) -> None:
+def _map(config: AirConfig, flight: str, datum: Datum, photos: Queue[Photo | Jump | None], records: Queue[Any]) -> None:
     """The process: until SIGTERM."""
     root = logging.getLogger()
     root.addHandler(QueueHandler(records))

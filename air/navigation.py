@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from air.jump import Jump
 from air.odometry.odometry import Odometry, Output, Stage, unwatched
 from air.odometry.settings import OdometrySettings
 from air.sensors.calibration import Calibration
@@ -30,11 +31,14 @@ class Navigator:
         settings: OdometrySettings,
         stage: Stage = unwatched,
         datum: Datum | None = None,
+        revision: int = 0,
     ) -> None:
-        """`stage` watches the parts of the work; `datum`, when the flight has one already, stays."""
+        """`stage` watches the parts of the work; `datum`, when the flight has one already, stays. The odometry's world
+        begins with a `revision`."""
         self._flight = flight
         self._camera, calibration = mounted(known) or ("", None)
         self.odometry = Odometry(calibration, flight, with_lever_arm(settings, known), known.p_base_ecef, stage)
+        self.odometry.estimator.revision = revision
         self._picker = StillPicker(known.cameras)
         self._T_flight_odometry = SE3.identity()
         self.datum = datum
@@ -48,11 +52,11 @@ class Navigator:
             if isinstance(message, Pose | Keyframe) and not in_world:
                 continue
             out += self._settle(message) if isinstance(message, Datum) else [self._moved(message)]
-            if isinstance(message, Datum | Pose):
+            if isinstance(message, Datum | Pose | Jump):
                 out += self._pick(message)
         return out + self._pick(measurement)
 
-    def _pick(self, message: Sensed | Datum | Pose) -> list[Output | Photo]:
+    def _pick(self, message: Sensed | Datum | Pose | Jump) -> list[Output | Photo]:
         photo = self._picker.feed(message)
         if photo is None:
             return []

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 
 from air.config import AirConfig
 from air.flight import flight_now
+from air.jump import Jump
 from air.live import LiveMap
 from air.preparation import prepared
 from air.sources.navigated import Navigated
@@ -125,16 +126,20 @@ class Mapping:
     def _map(self) -> None:
         self._say()
         for photo in prepared(self._arriving(), self._config.alignment):
-            arrived_s, begun_s = self._arrived_s.popleft(), time.monotonic()
-            self._grow(self._live.align(photo), photo.photo.name, arrived_s, begun_s)
+            begun_s = time.monotonic()
+            if isinstance(photo, Jump):
+                self._grow(self._live.move(photo), "jump of the world", begun_s, begun_s)
+            else:
+                self._grow(self._live.align(photo), photo.photo.name, self._arrived_s.popleft(), begun_s)
             self._correct(in_flight=True)
         self._finish()
 
-    def _arriving(self) -> Iterator[Photo]:
-        """The photos, each noted when it arrives."""
+    def _arriving(self) -> Iterator[Photo | Jump]:
+        """The photos, each noted when it arrives, and the jumps between them."""
         for photo in self._source:
-            log.info("%s arrived", photo.name)
-            self._arrived_s.append(time.monotonic())
+            if isinstance(photo, Photo):
+                log.info("%s arrived", photo.name)
+                self._arrived_s.append(time.monotonic())
             yield photo
 
     def _grow(self, keyframes: list[Keyframe], name: str, arrived_s: float, begun_s: float) -> None:

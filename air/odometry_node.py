@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 from air.config import AirConfig
+from air.jump import Jump
 from air.navigation import Navigator
 from air.sources.known import Known
 from common.bus import Bus
@@ -33,10 +34,10 @@ class OdometryNode:
         known: Known,
         flight: str,
         bus: Bus,
-        map_photo: Callable[[Photo, Datum], None],
+        map_photo: Callable[[Photo | Jump, Datum], None],
         clock: Clock | None = None,
     ) -> None:
-        """`map_photo` takes the photos, in the world of a datum that stays for the flight."""
+        """`map_photo` takes the photos, in the world of a datum that stays for the flight, and the jumps of that."""
         self._config, self._known, self._flight = config, known, flight
         self._bus, self._map_photo, self._clock = bus, map_photo, clock or SystemClock()
         self._navigator = Navigator(known, flight, config.odometry)
@@ -53,11 +54,12 @@ class OdometryNode:
             told = self._navigator.feed(measurement)
         except Exception:
             log.exception("the odometry failed and begins anew")
-            self._navigator = Navigator(self._known, self._flight, self._config.odometry, datum=self._datum)
+            settings, revision = self._config.odometry, self._posed_revision + 1
+            self._navigator = Navigator(self._known, self._flight, settings, datum=self._datum, revision=revision)
             return
         for message in told:
             match message:
-                case Photo():
+                case Photo() | Jump():
                     assert self._datum is not None
                     self._map_photo(message, self._datum)
                 case Datum():

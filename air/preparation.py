@@ -9,25 +9,28 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from air.alignment.prepare import PreparedPhoto, prepare
 from air.alignment.settings import AlignmentSettings
+from air.jump import Jump
 from common.messages import Photo
 
 AHEAD = 6
 WORKERS = 2
+Waiting = Future[PreparedPhoto] | Jump | BaseException | None
 
 
-def prepared(photos: Iterable[Photo], settings: AlignmentSettings) -> Iterator[PreparedPhoto]:
-    """The photos in their order, each prepared by a pool of threads while earlier ones are worked on.
+def prepared(photos: Iterable[Photo | Jump], settings: AlignmentSettings) -> Iterator[PreparedPhoto | Jump]:
+    """The photos in their order, each prepared by a pool of threads while earlier ones are worked on; jumps between.
 
     At most a few are held at a time, so a long flight needs no more memory. An error of the source is raised here.
     """
-    waiting: queue.Queue[Future[PreparedPhoto] | BaseException | None] = queue.Queue(AHEAD)
+    waiting: queue.Queue[Waiting] = queue.Queue(AHEAD)
     stop = threading.Event()
     with ThreadPoolExecutor(WORKERS, "prepare") as pool:
 
         def read() -> None:
             try:
                 for photo in photos:
-                    if not _put(waiting, pool.submit(prepare, photo, settings), stop):
+                    item = photo if isinstance(photo, Jump) else pool.submit(prepare, photo, settings)
+                    if not _put(waiting, item, stop):
                         return
                 _put(waiting, None, stop)
             except BaseException as error:
@@ -39,18 +42,16 @@ def prepared(photos: Iterable[Photo], settings: AlignmentSettings) -> Iterator[P
             while (item := waiting.get()) is not None:
                 if isinstance(item, BaseException):
                     raise item
-                yield item.result()
+                yield item if isinstance(item, Jump) else item.result()
         finally:
             stop.set()
             reader.join()
 
 
-def _put(
-    waiting: queue.Queue[Future[PreparedPhoto] | BaseException | None], item: object, stop: threading.Event
-) -> bool:
+def _put(waiting: queue.Queue[Waiting], item: Waiting, stop: threading.Event) -> bool:
     while not stop.is_set():
         try:
-            waiting.put(item, timeout=0.1)  # type: ignore[arg-type]
+            waiting.put(item, timeout=0.1)
         except queue.Full:
             continue
         return True

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from air.alignment.alignment import Alignment
 from air.config import AirConfig
+from air.jump import Jump
 from air.mapping.mapper import Mapper
 from air.odometry_report import Consistency, Told
 from air.preparation import prepared
@@ -74,10 +75,15 @@ def _make_folder(out: Path) -> None:
 
 def _align(source: PhotoSource, alignment: Alignment, mapper: Mapper, config: AirConfig, quiet: bool) -> None:
     photos = prepared(source, config.alignment)
-    for index, photo in enumerate(tqdm(photos, "aligning", length_hint(source) or None, unit="photo", disable=quiet)):
+    index = 0
+    for photo in tqdm(photos, "aligning", length_hint(source) or None, unit="photo", disable=quiet):
+        if isinstance(photo, Jump):
+            alignment.move(photo)
+            continue
         alignment.add(photo)
         if photo.image is not None:
             mapper.add_image(index, photo.image)
+        index += 1
 
 
 def _map(keyframes: list[Keyframe], mapper: Mapper, alignment: Alignment, quiet: bool) -> list[MapTile]:

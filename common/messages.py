@@ -36,7 +36,8 @@ class Photo:
     """One still image of a camera, as its source gave it.
 
     `jpeg` is the encoded file, maybe damaged. `camera` is a first guess or None when nothing is known.
-    `R_enu_cam` (3, 3) is the camera's attitude in local ENU with `attitude_sigma` rad, or None.
+    `R_enu_cam` (3, 3) is the camera's attitude in local ENU with `attitude_sigma` rad, or None. `revision` is that of
+    the odometry's world where the odometry placed the photo, None where it did not.
     """
 
     t_ns: int
@@ -46,6 +47,7 @@ class Photo:
     fix: GnssFix | None
     R_enu_cam: F64 | None = None
     attitude_sigma: float = 0.0
+    revision: int | None = None
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from air.alignment.bundle import DOWN, PosePrior
-from air.alignment.geometry import PairPrior, relative_pose, triangulate_pair
-from air.alignment.georeference import georeference
+from air.alignment.bundle import PosePrior
+from air.alignment.geometry import relative_pose, triangulate_pair
+from air.alignment.georeference import Similarity, georeference
 from air.alignment.matching import match
 from air.alignment.prepare import Features, PreparedPhoto, thumbnail
+from air.alignment.priors import pair_prior, pose_prior, position, step
 from air.alignment.reconstruction import Reconstruction
 from air.alignment.settings import AlignmentSettings
 from air.alignment.status import PhotoStatus, State
+from air.jump import Jump
 from common.arrays import F64, I64
 from common.camera import CameraModel
-from common.geo import T_ecef_enu, geodetic_to_ecef
 from common.messages import Datum, GnssFix, Keyframe, Photo
 from common.se3 import SE3
 
@@ -43,8 +44,9 @@ class _Entry:
 class Alignment:
     """Incremental alignment of photos.
 
-    `add` takes prepared photos in any order and returns the keyframes that are new or have moved; `finish` adjusts
-    everything once more and returns what moved. Photos that fit nowhere wait, and are placed when others connect them.
+    `add` takes prepared photos in any order and returns the keyframes that are new or have moved; `move` follows the
+    odometry's world; `finish` adjusts everything once more and returns what moved. Photos that fit nowhere wait, and
+    are placed when others connect them.
     """
 
     def __init__(self, flight: str, settings: AlignmentSettings | None = None) -> None:
@@ -67,6 +69,22 @@ class Alignment:
             return []
         self._match(index)
         self._grow()
+        return self._moved(self.settings.moved)
+
+    def move(self, jump: Jump) -> list[Keyframe]:
+        """Keyframes that moved because the world did in which the odometry had placed their photos."""
+        moved = {i for i, entry in self._entries.items() if jump.moves(entry.photo)}
+        for i in moved:
+            entry = self._entries[i]
+            entry.photo = jump.moved(entry.photo)
+            entry.p_ecef = position(entry.photo)
+            self._block.priors[i] = self._prior(entry.photo)
+        if self.datum is not None:
+            # What stands half on other fixes as well settles between them when all photos are adjusted next.
+            blocks = [self._block.photos(component) for component in range(self._components)]
+            along = [i for block in blocks if 2 * len(moved & set(block)) > len(block) for i in block]
+            T = jump.at(self.datum)
+            self._block.move(along, Similarity(1.0, T.R, T.t))
         return self._moved(self.settings.moved)
 
     def finish(self) -> list[Keyframe]:
@@ -126,26 +144,14 @@ class Alignment:
         if fault is not None or prepared.image is None or prepared.features is None or prepared.camera is None:
             self._faults[index] = fault or "no image"
             return None
-        p_ecef = None
-        if photo.fix is not None:
-            p_ecef = geodetic_to_ecef(photo.fix.latitude_deg, photo.fix.longitude_deg, photo.fix.height)
-        self._entries[index] = _Entry(photo, thumbnail(prepared.image), prepared.features, p_ecef)
+        self._entries[index] = _Entry(photo, thumbnail(prepared.image), prepared.features, position(photo))
         scale = max(1.0, max(prepared.image.shape[:2]) / self.settings.working_px)
         uv = prepared.features.uv.astype(np.float64)
         self._block.add_photo(index, uv, scale, prepared.camera, self._prior(photo))
         return index
 
     def _prior(self, photo: Photo) -> PosePrior:
-        p_world, p_sigma = None, np.zeros(3)
-        if photo.fix is not None and self.datum is not None:
-            fix = photo.fix
-            p_ecef = geodetic_to_ecef(fix.latitude_deg, fix.longitude_deg, fix.height)
-            p_world = T_ecef_enu(self.datum).inverse().apply(p_ecef)
-            p_sigma = np.array([fix.sigma_horizontal, fix.sigma_horizontal, fix.sigma_vertical])
-        down, sigma = -DOWN, float(np.radians(self.settings.nadir_sigma_deg))
-        if photo.R_enu_cam is not None:
-            down, sigma = photo.R_enu_cam.T @ DOWN, photo.attitude_sigma
-        return PosePrior(p_world, p_sigma, down, sigma)
+        return pose_prior(photo, self.datum, self.settings.nadir_sigma_deg)
 
     def _match(self, index: int) -> None:
         block, mine = self._block, self._entries[index].features
@@ -210,17 +216,12 @@ class Alignment:
             if other not in self._block.poses:
                 continue
             found = self._relative_pose(other, photo)
-            step = self._step(other, photo)
-            if found is not None and step is not None:
-                T = self._block.poses[other] @ SE3(found.R, found.t * step)
+            length = step(self._entries[other].photo, self._entries[photo].photo)
+            if found is not None and length is not None:
+                T = self._block.poses[other] @ SE3(found.R, found.t * length)
                 self._block.place(photo, T, self._block.component[other])
                 return self._block.component[other]
         return None
-
-    def _step(self, a: int, b: int) -> float | None:
-        """Distance of two photos by GPS, m; None without fixes."""
-        p_a, p_b = self._entries[a].p_ecef, self._entries[b].p_ecef
-        return None if p_a is None or p_b is None else float(np.linalg.norm(p_b - p_a))
 
     def _relative_pose(self, a: int, b: int) -> SE3 | None:
         """`T_a_b` with a translation of length one from the matches of two photos; None if they do not tell it."""
@@ -229,7 +230,8 @@ class Alignment:
         uv_a, uv_b = block.uv[a][pairs[:, 0]], block.uv[b][pairs[:, 1]]
         camera_a, camera_b = block.camera(a), block.camera(b)
         threshold_px = self.settings.verify_px * block.scale_of[a]
-        found = relative_pose(camera_a, camera_b, uv_a, uv_b, threshold_px, self._pair_prior(a, b))
+        prior = pair_prior(self._entries[a].photo, self._entries[b].photo, self.settings.nadir_sigma_deg)
+        found = relative_pose(camera_a, camera_b, uv_a, uv_b, threshold_px, prior)
         if found is None or found[1].sum() < self.settings.min_matches:
             return None
         T_a_b, good = found
@@ -248,16 +250,6 @@ class Alignment:
         for other in linked - {component}:
             if len(self._block.photos(other)) <= len(self._block.photos(component)):
                 self._block.dissolve(other)
-
-    def _pair_prior(self, a: int, b: int) -> PairPrior:
-        prior_a, prior_b = self._prior(self._entries[a].photo), self._prior(self._entries[b].photo)
-        sigma = float(np.hypot(prior_a.down_sigma, prior_b.down_sigma))
-        fix_a, fix_b, step = self._entries[a].photo.fix, self._entries[b].photo.fix, self._step(a, b)
-        if fix_a is None or fix_b is None or not step:
-            return PairPrior(prior_a.down_cam, prior_b.down_cam, sigma, 0.0, 1.0)
-        height_sigma = float(np.hypot(fix_a.sigma_vertical, fix_b.sigma_vertical)) / step
-        descent = (fix_a.height - fix_b.height) / step
-        return PairPrior(prior_a.down_cam, prior_b.down_cam, sigma, descent, float(np.hypot(height_sigma, sigma)))
 
     def _start(self) -> bool:
         """Start a component from the best pair of photos that have none."""
@@ -346,11 +338,9 @@ class Alignment:
         if fit is None:
             return
         worse = np.array([fit.horizontal_factor, fit.horizontal_factor, fit.vertical_factor])
-        tracks = block.tracks_of(photos)
         for i, prior in zip(photos, priors, strict=True):
             block.priors[i] = replace(prior, p_sigma=prior.p_sigma * worse)
-            block.poses[i] = fit.similarity.pose(block.poses[i])
-        block.points.put(tracks, fit.similarity.points(block.points.at(tracks)))
+        block.move(photos, fit.similarity)
 
     def _moved(self, threshold: float) -> list[Keyframe]:
         """Keyframes of the photos whose ground has moved by more than a threshold, m, since they were last given."""

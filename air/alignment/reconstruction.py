@@ -9,6 +9,7 @@ import numpy as np
 
 from air.alignment.bundle import BundleProblem, BundleSolution, CameraPrior, PosePrior, adjust
 from air.alignment.geometry import reprojection_error, resect, triangulate
+from air.alignment.georeference import Similarity
 from air.alignment.points import Points
 from air.alignment.selection import select_tracks
 from air.alignment.settings import AlignmentSettings
@@ -95,6 +96,14 @@ class Reconstruction:
     def place(self, photo: int, pose: SE3, component: int) -> None:
         """Set the pose of a photo for the first time."""
         self.poses[photo], self.component[photo] = pose, component
+
+    def move(self, photos: Iterable[int], similarity: Similarity) -> None:
+        """Move placed photos and the points that they see."""
+        photos = list(photos)
+        tracks = self.tracks_of(photos)
+        for photo in photos:
+            self.poses[photo] = similarity.pose(self.poses[photo])
+        self.points.put(tracks, similarity.points(self.points.at(tracks)))
 
     def dissolve(self, component: int) -> None:
         """Take back the poses and points of a component; its photos can be placed again."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from air.alignment.prepare import thumbnail
+from air.jump import Jump
 from air.odometry.estimator import Estimate, Estimator
 from air.odometry.initial import KnownSpeed, Refusal
 from air.odometry.preintegration import InertialState
@@ -23,7 +24,7 @@ from common.measurements import CameraFrame, Encoding, FixKind, GnssEpoch, ImuSa
 from common.messages import Datum, EstimatorState, Keyframe, Mode, Photo, Pose
 from common.se3 import SE3
 
-Output = Pose | Keyframe | EstimatorState | Datum
+Output = Pose | Keyframe | EstimatorState | Datum | Jump
 Stage = Callable[[str], AbstractContextManager[None]]
 """What is entered for each of the named parts of the work."""
 BASE = "base"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from air.jump import Jump
 from air.navigation import Navigator
 from air.odometry.odometry import Output, Stage, unwatched
 from air.odometry.settings import OdometrySettings
@@ -42,11 +43,11 @@ class Navigated:
         """The problems of the source."""
         return self.source.problems
 
-    def __iter__(self) -> Iterator[Photo]:
+    def __iter__(self) -> Iterator[Photo | Jump]:
         self.navigator = navigator = Navigator(known_of(self.source), self.flight, self.settings, self.stage)
         for measurement in self.source:
             for told in navigator.feed(measurement):
-                if isinstance(told, Photo):
-                    yield told
-                else:
+                if not isinstance(told, Photo):
                     self.tell(told)
+                if isinstance(told, Photo | Jump):
+                    yield told

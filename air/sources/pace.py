@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from operator import length_hint
 
+from air.jump import Jump
 from air.sources.source import PhotoSource, Problem, Truth
 from common.messages import Photo
 
@@ -40,7 +41,7 @@ class Paced:
     def __length_hint__(self) -> int:
         return length_hint(self.source)
 
-    def __iter__(self) -> Iterator[Photo]:
+    def __iter__(self) -> Iterator[Photo | Jump]:
         first_t_ns: int | None = None
         start_s = 0.0
         for photo in self.source:

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast
 
+from air.jump import Jump
 from common.errors import SourceError
 from common.measurements import Measurement
 from common.messages import Photo
@@ -34,8 +35,8 @@ Sensed = Measurement | Photo
 """What a source can give."""
 
 
-class Source(Protocol):
-    """Measurements and photos in the order in which they came. `truth` is None for real flights."""
+class Described(Protocol):
+    """What every source says of itself. `truth` is None for real flights."""
 
     @property
     def url(self) -> str:
@@ -52,13 +53,17 @@ class Source(Protocol):
         """What was wrong on the way, as far as known: complete once the iteration has ended."""
         ...
 
+
+class Source(Described, Protocol):
+    """Measurements and photos in the order in which they came."""
+
     def __iter__(self) -> Iterator[Sensed]: ...
 
 
-class PhotoSource(Source, Protocol):
-    """A source of nothing but photos. One that knows how many has a length."""
+class PhotoSource(Described, Protocol):
+    """Photos, and the jumps of the world in which the odometry placed them. One that knows how many has a length."""
 
-    def __iter__(self) -> Iterator[Photo]: ...
+    def __iter__(self) -> Iterator[Photo | Jump]: ...
 
 
 def open_source(url: str) -> Source:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from air.jump import Jump
 from air.sensors.calibration import Calibration
 from air.sources.source import Sensed
 from common.arrays import F64
@@ -43,11 +44,12 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.MONO8: 1}
 
 @dataclass(frozen=True, eq=False)
 class _Sight:
-    """Where a camera was and how it looked: `R_enu_cam` with its sigma rad, or None."""
+    """Where a camera was and how it looked: `R_enu_cam` with its sigma rad, or None; as in `Photo`."""
 
     fix: GnssFix
     R_enu_cam: F64 | None
     sigma: float
+    revision: int | None = None
 
 
 class StillPicker:
@@ -65,7 +67,7 @@ class StillPicker:
         self._poses: deque[Pose] = deque(maxlen=2)
         self._waiting: deque[CameraFrame] = deque()
 
-    def feed(self, measurement: Sensed | Datum | Pose) -> Photo | None:
+    def feed(self, measurement: Sensed | Datum | Pose | Jump) -> Photo | None:
         """A photo, when this makes one of a frame. Measurements come in the order of time.
 
         After a `Datum` frames wait for the odometry's poses in its world, as long as such come.
@@ -81,12 +83,23 @@ class StillPicker:
             case Datum():
                 self._datum = measurement
                 self._poses.clear()
+            case Jump():
+                self._jump(measurement)
             case Pose():
+                if self._poses and self._poses[-1].revision != measurement.revision:
+                    self._poses.clear()
                 self._poses.append(measurement)
                 return self._passed()
             case CameraFrame():
                 return self._take(measurement)
         return None
+
+    def _jump(self, jump: Jump) -> None:
+        """Bring the latest poses into the new world, so that those to come can follow them."""
+        assert self._datum is not None
+        T = jump.at(self._datum)
+        moved = [replace(p, revision=jump.revision, T_world_body=T @ p.T_world_body) for p in self._poses]
+        self._poses = deque(moved, maxlen=2)
 
     def _take(self, frame: CameraFrame) -> Photo | None:
         self._camera = self._camera or frame.camera
@@ -122,7 +135,7 @@ class StillPicker:
         self._last_ecef = p_ecef
         name = f"{frame.camera}-{frame.index:06d}"
         camera = None if calibration is None else calibration.camera
-        return Photo(frame.t_ns, name, jpeg, camera, fix, sight.R_enu_cam, sight.sigma)
+        return Photo(frame.t_ns, name, jpeg, camera, fix, sight.R_enu_cam, sight.sigma, sight.revision)
 
     def _height(self, fix: GnssFix) -> float:
         """Above the start, m."""
@@ -151,7 +164,7 @@ class StillPicker:
         horizontal, vertical = float(np.hypot(*after.sigma[:2]) / np.sqrt(2)), float(after.sigma[2])
         R_ecef_enu = T_ecef_enu(Datum("", latitude_deg, longitude_deg, height)).R
         fix = GnssFix(latitude_deg, longitude_deg, height, horizontal, vertical)
-        return _Sight(fix, R_ecef_enu.T @ T_ecef_world.R @ T_world_cam.R, ODOMETRY_SIGMA)
+        return _Sight(fix, R_ecef_enu.T @ T_ecef_world.R @ T_world_cam.R, ODOMETRY_SIGMA, after.revision)
 
     def _received(self, frame: CameraFrame) -> _Sight | None:
         """By the receiver, its latest position carried on by its velocity, and by the airframe."""
