@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pymap3d
@@ -16,6 +17,7 @@ from air.config import AirConfig
 from air.jump import Jump
 from air.live import LiveMap
 from air.mapping.settings import MappingSettings
+from air.mapping_process import WAITING, MappingProcess, Taken
 from air.preparation import prepared
 from air.sources.simulated.survey import Survey, SurveyOptions
 from common.arrays import F64
@@ -70,6 +72,20 @@ def test_a_jump_is_the_same_at_any_datum() -> None:
 def test_jumps_keep_their_place_between_photos() -> None:
     items = list(prepared([photo(), jump(), photo()], AlignmentSettings()))
     assert [isinstance(item, Jump) for item in items] == [False, True, False]
+
+
+def test_a_mapper_that_is_behind_gets_every_jump() -> None:
+    process = MappingProcess(AirConfig(), "flight")
+    process.take(jump(), DATUM)  # nothing was mapped yet
+    process._process = SimpleNamespace(pid=1)  # type: ignore[assignment]
+    for _ in range(WAITING + 3):
+        process.take(photo(), DATUM)
+    process.take(jump(), DATUM)
+    process._photos.put(None)
+    taken = list(Taken(process._photos, lambda: None))
+    assert len(taken) == WAITING + 1
+    assert isinstance(taken[-1], Jump)
+    process._photos.cancel_join_thread()
 
 
 # The map

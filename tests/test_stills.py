@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from air.jump import Jump
 from air.sensors.calibration import Calibration
 from air.sources.source import Sensed, open_photos
 from air.sources.stills import STEP, StillPicker
@@ -115,10 +116,12 @@ def test_frames_of_a_second_camera_and_of_video_streams_are_left_alone() -> None
     assert picker.feed(frame(20.1)) is not None
 
 
-def pose(t_s: float, error: float = 0.0) -> Pose:
+def pose(t_s: float, error: float = 0.0, revision: int = 1) -> Pose:
     """The odometry's, which knows better than the receiver by how much that is off."""
     T_world_body = SE3(np.eye(3), np.array([SPEED * t_s + error, 0.0, HEIGHT]))
-    return Pose("", round(t_s * 1e9), 1, T_world_body, None, np.array([0.3, 0.4, 0.7]), Mode.GNSS_VISUAL_INERTIAL)
+    return Pose(
+        "", round(t_s * 1e9), revision, T_world_body, None, np.array([0.3, 0.4, 0.7]), Mode.GNSS_VISUAL_INERTIAL
+    )
 
 
 def test_once_the_odometry_knows_its_world_photos_are_where_it_says_until_it_falls_silent() -> None:
@@ -146,6 +149,22 @@ def test_once_the_odometry_knows_its_world_photos_are_where_it_says_until_it_fal
             assert photo.R_enu_cam is None
     assert sum(10.2 < photo.t_ns * 1e-9 < 29.9 for photo in taken) >= 6
     assert sum(photo.t_ns > 31 * SECOND_NS for photo in taken) >= 8
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_frame_at_a_jump_of_the_world_is_where_the_new_world_says(known: bool) -> None:
+    """The poses of before a jump serve with those after it, moved along, or not at all."""
+    picker = StillPicker(MOUNTED)
+    for m in (VehicleState(0, 1, height_home=HEIGHT), HOME, pose(0.0), pose(1.0)):
+        picker.feed(m)
+    assert picker.feed(frame(1.01)) is None  # waits for the poses to pass it
+    if known:
+        picker.feed(Jump(SECOND_NS, 2, HOME, SE3(np.eye(3), np.array([5.0, 0.0, 0.0]))))
+    photo = picker.feed(pose(1.02, error=5.0, revision=2))
+    assert photo is not None
+    assert photo.revision == 2
+    p = geodetic_to_enu(HOME, photo.fix.latitude_deg, photo.fix.longitude_deg, photo.fix.height)
+    assert_allclose(p, [SPEED * 1.01 + 5.0, 0.0, HEIGHT], atol=1e-3 if known else SPEED * 0.01 + 1e-3)
 
 
 @pytest.mark.slow
