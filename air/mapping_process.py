@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import queue
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from logging.handlers import QueueHandler, QueueListener
+from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.queues import Queue
 from typing import Any
@@ -66,7 +69,8 @@ class MappingProcess:
         self._process.terminate()
         self._process.join(STOP_S)
         self._process.kill()
-        self._listener.stop()
+        if self._process.exitcode == 0:  # one that was killed may have left its queue locked, for ever
+            self._listener.stop()
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ class Taken:
 
 
 def _map(config: AirConfig, flight: str, datum: Datum, photos: Queue[Photo | Jump | None], records: Queue[Any]) -> None:
-    """The process: until SIGTERM."""
+    """The process: until SIGTERM, or until the odometry is gone."""
     root = logging.getLogger()
     root.addHandler(QueueHandler(records))
     root.setLevel(logging.INFO)
@@ -100,4 +104,13 @@ def _map(config: AirConfig, flight: str, datum: Datum, photos: Queue[Photo | Jum
 
     # Ctrl-C reaches every process of a terminal; the odometry tells this one when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
     map_photos(config, flight, datum, lambda check_stop: Taken(photos, check_stop))
+
+
+def _end_with_parent() -> None:
+    """Stop this process when the one that feeds it is gone, however that ended."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        wait([parent.sentinel])
+        log.error("the odometry is gone, and the mapper ends with it")
+        os.kill(os.getpid(), signal.SIGTERM)

@@ -9,10 +9,10 @@ import queue
 import signal
 import threading
 import time
+from ctypes import c_ulong
 from dataclasses import replace
 from logging.handlers import QueueHandler, QueueListener
 from multiprocessing.queues import Queue
-from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import BoundedSemaphore
 from typing import Any
 
@@ -30,53 +30,86 @@ WAITING = 20_000
 STOP_S = 5.0
 """More than the mapper, which this process ends, may take to end."""
 LOOK_S = 0.2
+AGAIN_S = 5.0
+"""After a start, until the next one: what ends at once must not keep the computer busy."""
+Dropped = c_ulong
+"""Counts; only the one that drops writes it."""
 Item = tuple[float, Measurement] | None
 """A measurement with the monotonic time s at which it was put; None at the end."""
 
 
 class OdometryProcess:
-    """Follows the aircraft through what its devices measure. The process begins with the first sample or frame."""
+    """Follows the aircraft through what its devices measure. The process begins with the first sample or frame.
+
+    Another takes the place of one that has ended by itself, and begins a flight of its own: what the first one knew of
+    the world and of the map is gone.
+    """
 
     def __init__(self, config: AirConfig, known: Known) -> None:
         # It listens nowhere: that is the place of the node of the devices.
-        config = replace(config, bus=replace(config.bus, listen=()))
-        context = multiprocessing.get_context("spawn")
-        self._measurements: Queue[Item] = context.Queue(WAITING)
-        self._room: BoundedSemaphore = context.BoundedSemaphore(FRAMES)
-        self._dropped: Synchronized[int] = context.Value("L", 0)
-        self._records: Queue[Any] = context.Queue()
-        shared = (self._measurements, self._room, self._dropped, self._records)
-        self._process = context.Process(target=_navigate, args=(config, known, flight_now(), *shared), name="odometry")
-        self._listener = QueueListener(self._records, *logging.getLogger().handlers)
-        self._ended = False
+        self._config, self._known = replace(config, bus=replace(config.bus, listen=())), known
+        self._process = _Process(self._config, self._known)
 
     def take(self, measurement: Measurement) -> None:
         """Hand a measurement on; a frame for which there is no room is dropped and counted. Returns at once."""
-        if self._ended or isinstance(measurement, RawBytes | ClockState):
+        if isinstance(measurement, RawBytes | ClockState):
             return
+        if self._process.exitcode is not None:
+            if time.monotonic() - self._process.begun_s < AGAIN_S:
+                return
+            log.error("the odometry has ended with exit code %d: it begins anew", self._process.exitcode)
+            self._process.close()
+            self._process = _Process(self._config, self._known)
+        self._process.take(measurement)
+
+    def finish(self) -> None:
+        """No more measurements come: the mapper adjusts all photos once more, and stays for those who ask."""
+        self._process.finish()
+
+    def close(self) -> None:
+        """End the process, if it began."""
+        self._process.close()
+
+
+class _Process:
+    """One process, with queues of its own: a process that is killed may leave locks of its queues behind."""
+
+    def __init__(self, config: AirConfig, known: Known) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._measurements: Queue[Item] = context.Queue(WAITING)
+        self._room: BoundedSemaphore = context.BoundedSemaphore(FRAMES)
+        self.dropped: Dropped = context.RawValue("L", 0)
+        records: Queue[Any] = context.Queue()
+        shared = (self._measurements, self._room, self.dropped, records)
+        self._process = context.Process(target=_navigate, args=(config, known, flight_now(), *shared), name="odometry")
+        self._listener = QueueListener(records, *logging.getLogger().handlers)
+        self.begun_s = 0.0
+
+    @property
+    def exitcode(self) -> int | None:
+        """None until it has begun and ended."""
+        return self._process.exitcode
+
+    def take(self, measurement: Measurement) -> None:
         if isinstance(measurement, CameraFrame) and not self._room.acquire(block=False):
-            self._drop()
+            self.dropped.value += 1
             return
         try:
             self._measurements.put_nowait((time.monotonic(), measurement))
         except queue.Full:
-            self._drop()
+            self.dropped.value += 1
             if isinstance(measurement, CameraFrame):
                 self._room.release()
         if self._process.pid is None and isinstance(measurement, CameraFrame | ImuSample):
+            self.begun_s = time.monotonic()
             self._listener.start()
             self._process.start()
-        elif self._process.exitcode is not None:
-            self._ended = True
-            log.error("the odometry has ended with exit code %d: there are no poses and no map", self._process.exitcode)
 
     def finish(self) -> None:
-        """No more measurements come: the mapper adjusts all photos once more, and stays for those who ask."""
-        if self._process.pid is not None and not self._ended:
+        if self._process.pid is not None:
             self._measurements.put(None)
 
     def close(self) -> None:
-        """End the process, if it began."""
         # What was put and not taken must not hold up the end of this program.
         self._measurements.cancel_join_thread()
         if self._process.pid is None:
@@ -84,11 +117,8 @@ class OdometryProcess:
         self._process.terminate()
         self._process.join(STOP_S)
         self._process.kill()
-        self._listener.stop()
-
-    def _drop(self) -> None:
-        with self._dropped.get_lock():
-            self._dropped.value += 1
+        if self._process.exitcode == 0:  # one that was killed may have left its queue locked, for ever
+            self._listener.stop()
 
 
 def _navigate(
@@ -97,7 +127,7 @@ def _navigate(
     flight: str,
     measurements: Queue[Item],
     room: BoundedSemaphore,
-    dropped: Synchronized[int],
+    dropped: Dropped,
     records: Queue[Any],
 ) -> None:
     """The process: until SIGTERM, or until the one that it serves is gone."""

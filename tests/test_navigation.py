@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 from heapq import merge
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from device_ports import wait_for
 from gnss_flight import DATUM, START_NS, GnssFlight, flight
 from numpy.testing import assert_allclose
 from odometry_scene import T_BODY_CAM
@@ -36,6 +43,7 @@ from common.streams import DATUM as DATUM_STREAM
 from common.streams import HEALTH, POSE, Stream
 from common.wire import decode
 
+ROOT = Path(__file__).parents[1]
 CAMERA = CameraModel(128, 72, 64.0, 64.0, 63.5, 35.5)
 SECONDS, BEGUN = 50, 30
 """GNSS and IMU alone know the attitude after the first turns."""
@@ -240,11 +248,11 @@ def test_an_odometry_that_fails_begins_anew_in_the_same_world() -> None:
 
 def test_frames_for_which_there_is_no_room_are_dropped_and_told() -> None:
     process = OdometryProcess(AirConfig(), Known())
-    process._process = SimpleNamespace(pid=1, exitcode=None)  # type: ignore[assignment]
+    process._process._process = SimpleNamespace(pid=1, exitcode=None)  # type: ignore[assignment]
     for k in range(FRAMES + 3):
         process.take(frame(k, k))
-    assert process._dropped.value == 3
-    process._process = SimpleNamespace(pid=None)  # type: ignore[assignment]
+    assert process._process.dropped.value == 3
+    process._process._process = SimpleNamespace(pid=None)  # type: ignore[assignment]
     process.close()
     bus = _Bus()
     node = OdometryNode(AirConfig(), Known(), "flight", bus, lambda *_: None)  # type: ignore[arg-type]
@@ -254,3 +262,59 @@ def test_frames_for_which_there_is_no_room_are_dropped_and_told() -> None:
     assert payload
     assert health.level is Level.DEGRADED
     assert "3 frames were dropped" in health.text
+
+
+# Processes that die
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody asked how does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_an_odometry_that_was_killed_is_replaced_by_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("air.odometry_process.AGAIN_S", 0.0)
+    process = OdometryProcess(AirConfig(), Known())
+    sample = ImuSample(1, np.array([0.0, 0.0, 9.8]), np.zeros(3))
+    try:
+        process.take(sample)
+        first = process._process._process.pid
+        assert first is not None
+        os.kill(first, signal.SIGKILL)
+        wait_for(lambda: process._process.exitcode is not None, 10.0)
+        process.take(sample)
+        second = process._process._process.pid
+        assert second not in (None, first)
+        assert process._process.exitcode is None
+    finally:
+        process.close()
+
+
+MAPPER = """
+import sys, time
+from air.config import AirConfig
+from air.mapping_process import MappingProcess
+from common.messages import Datum, Photo
+process = MappingProcess(AirConfig(), "flight")
+process.take(Photo(1, "a", b"", None, None), Datum("flight", 0.0, 0.0, 0.0))
+print(process._process.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_mapper_ends_when_the_odometry_is_killed() -> None:
+    command = [sys.executable, "-c", MAPPER]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as odometry:
+        assert odometry.stdout is not None
+        mapper = int(odometry.stdout.readline())
+        time.sleep(1.0)
+        assert is_alive(mapper)
+        odometry.kill()
+    try:
+        wait_for(lambda: not is_alive(mapper), 30.0)
+    finally:
+        if is_alive(mapper):
+            os.kill(mapper, signal.SIGKILL)
