@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from air.odometry.odometry import Odometry, Output
+from air.pose_log import PoseLog
 from common.arrays import F64
 from common.export.trajectory import Trajectory
 from common.geo import T_world_other
@@ -57,8 +58,8 @@ class Consistency:
 class Told:
     """What the odometry has told so far; poses and keyframes are those in the world of the datum once there is one."""
 
-    poses: list[Pose] = field(default_factory=list)
-    keyframes: list[Keyframe] = field(default_factory=list)
+    poses: PoseLog = field(default_factory=PoseLog)
+    keyframes: PoseLog = field(default_factory=PoseLog)
     states: list[EstimatorState] = field(default_factory=list)
     datum: Datum | None = None
     first_pose_ns: int | None = None
@@ -71,15 +72,15 @@ class Told:
         match message:
             case Datum():
                 self.datum = message
-                self.poses, self.keyframes = [], []
+                self.poses, self.keyframes = PoseLog(), PoseLog()
             case Pose():
                 self._note_mode(message)
                 self.first_pose_ns = self.first_pose_ns or message.t_ns
                 if self.datum is not None:
                     self.world_ns = self.world_ns or message.t_ns
-                self.poses.append(message)
+                self.poses.add(message.t_ns, message.T_world_body, message.sigma)
             case Keyframe():
-                self.keyframes.append(message)
+                self.keyframes.add(message.t_ns, message.T_world_cam, message.sigma)
             case EstimatorState():
                 self._note_mode(message)
                 self.states.append(message)
@@ -93,19 +94,19 @@ class Told:
         """The poses against a true trajectory of the body in the world of a datum; None where they share no time."""
         if self.datum is None or not len(truth.t_ns):
             return None
-        within = [p for p in self.poses if truth.t_ns[0] <= p.t_ns <= truth.t_ns[-1]]
-        if not within:
+        all_ns = self.poses.t_ns
+        within = np.flatnonzero((truth.t_ns[0] <= all_ns) & (all_ns <= truth.t_ns[-1]))
+        if not len(within):
             return None
-        seconds = np.array([pose.t_ns // 1_000_000_000 for pose in within])
-        poses = [within[i] for i in np.unique(seconds, return_index=True)[1]]
-        t_ns = np.array([pose.t_ns for pose in poses])
+        chosen = within[np.unique(all_ns[within] // 1_000_000_000, return_index=True)[1]]
+        t_ns = all_ns[chosen]
         since_ns, true_ns = t_ns - truth.t_ns[0], truth.t_ns - truth.t_ns[0]
         p_true = np.column_stack([np.interp(since_ns, true_ns, axis) for axis in truth.positions.T])
-        errors = T_world_other(datum, self.datum).apply(np.array([pose.T_world_body.t for pose in poses])) - p_true
-        sigmas = np.maximum(np.array([pose.sigma for pose in poses]), LEAST_SIGMA)
+        errors = T_world_other(datum, self.datum).apply(self.poses.positions[chosen]) - p_true
+        sigmas = np.maximum(self.poses.sigmas[chosen], LEAST_SIGMA)
         lengths = np.linalg.norm(errors, axis=1)
         rmse, nees = float(np.sqrt(np.mean(lengths**2))), float(np.mean(np.sum((errors / sigmas) ** 2, axis=1)))
-        return Consistency(len(poses), rmse, float(lengths.max()), nees)
+        return Consistency(len(chosen), rmse, float(lengths.max()), nees)
 
     def report(self, odometry: Odometry) -> OdometryReport:
         """All of it summed up."""
@@ -118,7 +119,7 @@ class Told:
             refused_samples=odometry.estimator.buffer.refused,
             first_pose_s=_since(self.first_pose_ns, first_ns),
             world_found_s=_since(self.world_ns, first_ns),
-            travelled_m=_length(self.poses[::10]),
+            travelled_m=_length(self.poses.positions[::10]),
             modes=[((t_ns - first_ns) * 1e-9, mode) for t_ns, mode in self.modes],
             modes_s=self._durations_s(),
             notes=[((t_ns - first_ns) * 1e-9, text) for t_ns, text in odometry.notes],
@@ -127,7 +128,10 @@ class Told:
                 "reprojection_px": _statistics(rms_px),
                 "points": _statistics([state.points for state in self.states]),
                 "satellites": _statistics([state.satellites for state in self.states]),
-                "position_sigma_m": _statistics([float(np.linalg.norm(pose.sigma)) for pose in self.poses[::100]]),
+                "code_rms_m": _statistics([state.code_rms_m for state in self.states]),
+                "doppler_rms_mps": _statistics([state.doppler_rms_mps for state in self.states]),
+                "carrier_rms_m": _statistics([state.carrier_rms_m for state in self.states]),
+                "position_sigma_m": _statistics(np.linalg.norm(self.poses.sigmas[::100], axis=1).tolist()),
             },
         )
 
@@ -143,8 +147,7 @@ def _since(t_ns: int | None, first_ns: int) -> float | None:
     return None if t_ns is None else (t_ns - first_ns) * 1e-9
 
 
-def _length(poses: Sequence[Pose]) -> float:
-    p: F64 = np.array([pose.T_world_body.t for pose in poses]).reshape(-1, 3)
+def _length(p: F64) -> float:
     return float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum())
 
 

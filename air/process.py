@@ -103,14 +103,14 @@ def _write(out: Path, source: PhotoSource, datum: Datum, tiles: list[MapTile], k
 
 def _write_odometry(out: Path, told: Told, datum: Datum) -> None:
     """Write the odometry's own trajectory of the body, in the world of the map."""
-    if told.datum is not None and told.poses:
+    if told.datum is not None and len(told.poses):
         T = T_world_other(datum, told.datum)
-        write_tum(out / ODOMETRY, [p.t_ns for p in told.poses], [T @ p.T_world_body for p in told.poses])
+        write_tum(out / ODOMETRY, told.poses.t_ns, (T @ T_world_body for T_world_body in told.poses))
 
 
 def _against_truth(told: Told, out: Path) -> Consistency | None:
     """The odometry against the truth that was written beside it; None where nothing was told."""
-    if not told.poses:
+    if not len(told.poses):
         return None
     return told.compare(read_tum(out / TRUTH / "trajectory.tum"), read_datum(out / TRUTH / "datum.json"))
 

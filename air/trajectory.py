@@ -97,9 +97,9 @@ def _unknown(source: Source, camera: str) -> CalibrationError:
 def _write(out: Path, told: Told, report: TrajectoryReport) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_tum(out / "trajectory.tum", [p.t_ns for p in told.poses], [p.T_world_body for p in told.poses])
+        write_tum(out / "trajectory.tum", told.poses.t_ns, told.poses)
         if report.frames:
-            write_tum(out / "keyframes.tum", [k.t_ns for k in told.keyframes], [k.T_world_cam for k in told.keyframes])
+            write_tum(out / "keyframes.tum", told.keyframes.t_ns, told.keyframes)
         if told.datum is not None:
             write_datum(out / "datum.json", told.datum)
         (out / "report.json").write_text(json.dumps(asdict(report), indent=2) + "\n")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -40,12 +40,13 @@ def newest_keyframes(keyframes: Iterable[Keyframe]) -> list[Keyframe]:
     return sorted(newest.values(), key=lambda keyframe: (keyframe.t_ns, keyframe.index))
 
 
-def write_tum(path: Path, t_ns: Sequence[int] | I64, poses: Sequence[SE3]) -> None:
+def write_tum(path: Path, t_ns: Iterable[int], poses: Iterable[SE3]) -> None:
     """Write lines `t x y z qx qy qz qw`: t in s with all nanoseconds, position in m, unit quaternion with w last.
 
     Source: J. Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems (IROS 2012).
     """
-    path.write_text("".join(map(tum_line, t_ns, poses)), encoding="ascii")
+    with path.open("w", encoding="ascii") as file:
+        file.writelines(map(tum_line, t_ns, poses))
 
 
 def tum_line(t_ns: int, pose: SE3) -> str:
