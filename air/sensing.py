@@ -11,14 +11,16 @@ from typing import Protocol
 from air.config import AirConfig
 from air.devices.status import DeviceStatus
 from air.odometry_process import OdometryProcess
+from air.sensors.gnss_rtcm import RtcmReceiver
 from air.sources.known import Known
 from air.sources.live import Live
+from air.sources.played import Played
 from air.sources.source import open_source
 from common.bus import Bus, ZenohBus
 from common.clock import Clock, SystemClock
-from common.errors import BusError, SourceError, WireError
+from common.errors import BusError, WireError
 from common.keys import alive_key, message_key, stream_key
-from common.measurements import Measurement, RawBytes
+from common.measurements import Measurement, RawBytes, ReceiverSolution
 from common.messages import Health, Message
 from common.streams import HEALTH, RTCM, STREAMS, Stream
 from common.wire import decode, encode
@@ -32,7 +34,7 @@ STREAM_OF: dict[type[Message], Stream] = {stream.message: stream for stream in S
 
 
 class Devices(Protocol):
-    """Devices that are read until they are closed: those on board, or simulated ones."""
+    """Devices that are read until they are closed: those on board, simulated or recorded ones."""
 
     def __iter__(self) -> Iterator[Measurement]: ...
 
@@ -59,7 +61,7 @@ def sense(config: AirConfig, url: str) -> int:
     is, and the map of what it sees.
 
     `live:` alone takes the devices of `config`; a simulated flight, `sim:plain` and the like, is flown at the pace of
-    time. Raises SourceError, ConfigError and BusError.
+    time, and a recording at that of `config`. Raises SourceError, ConfigError and BusError.
     """
     live = _open(config, url)
     stop = threading.Event()
@@ -94,7 +96,7 @@ def _open(config: AirConfig, url: str) -> Devices:
 
         if isinstance(source, SimulatedFlight):
             return LiveFlight(source)
-    raise SourceError(f"source {url!r} is no live source; use live:, live:FILE.toml, or a simulated flight")
+    return Played(source, config.pace)
 
 
 class Sensing:
@@ -105,6 +107,7 @@ class Sensing:
     ) -> None:
         """`tap` is given every measurement after it was published."""
         self._live, self._bus, self._vehicle, self._clock, self._tap = live, bus, vehicle, clock, tap
+        self._base = RtcmReceiver()
         self._ended = threading.Event()
         self._beat = threading.Thread(target=self._beat_on, name="beat", daemon=True)
 
@@ -115,19 +118,29 @@ class Sensing:
         self._beat.start()
         try:
             for measurement in self._live:
-                self._publish(STREAM_OF[type(measurement)], measurement)
-                if self._tap is not None:
-                    self._tap(measurement)
+                self._tell(measurement)
+                if isinstance(measurement, ReceiverSolution):
+                    self._base.near_ns = measurement.t_ns
         finally:
             self._ended.set()
             corrections.close()
             alive.close()
 
     def _correct(self, key: str, payload: bytes) -> None:
+        """Hand what a base station sends to the receiver on board, and what it measured to the odometry."""
         try:
-            self._live.correct(decode(RawBytes, payload).data)
+            data = decode(RawBytes, payload).data
         except WireError as error:
             log.warning("%s: %s", key, error)
+            return
+        self._live.correct(data)
+        for epoch in self._base.feed(data, 0):
+            self._tell(epoch)
+
+    def _tell(self, measurement: Measurement) -> None:
+        self._publish(STREAM_OF[type(measurement)], measurement)
+        if self._tap is not None:
+            self._tap(measurement)
 
     def _beat_on(self) -> None:
         while not self._ended.wait(BEAT_S):

@@ -14,7 +14,8 @@ from common.framing import UNFINISHED, FrameScanner
 
 PREAMBLE = 0xD3
 _HEADER, _CRC = 3, 3
-_PLACE_BYTES = {1005: 19, 1006: 21}
+PLACES = {1005: 19, 1006: 21}
+"""Messages that tell where a station stands, and their bytes."""
 _LEAST_RADIUS, _MOST_RADIUS = 6.3e6, 6.5e6
 """Distances from the centre of the earth where stations stand, m."""
 
@@ -65,6 +66,13 @@ def is_msm(number: int) -> bool:
     return 1071 <= number <= 1137 and 1 <= number % 10 <= 7
 
 
+def second_of(payload: bytes) -> int:
+    """Which second of the week, or of its day for GLONASS, a multiple signal message is of."""
+    told = int.from_bytes(payload[3:7], "big") >> 2
+    glonass = 1081 <= int.from_bytes(payload[:2], "big") >> 4 <= 1087
+    return (told & (1 << 27) - 1 if glonass else told) // 1000
+
+
 def pack_place(station: int, p_ecef: F64) -> bytes:
     """Message 1006 of a station whose antenna's reference point is at (3,) m, ECEF, upon its mark.
 
@@ -78,7 +86,7 @@ def pack_place(station: int, p_ecef: F64) -> bytes:
     bits = 0
     for value, width in fields:
         bits = bits << width | value
-    return bits.to_bytes(_PLACE_BYTES[1006], "big")
+    return bits.to_bytes(PLACES[1006], "big")
 
 
 def parse_place(payload: bytes) -> F64 | None:
@@ -87,7 +95,7 @@ def parse_place(payload: bytes) -> F64 | None:
     None for any other message, and for a station that does not know its place yet.
     """
     number = int.from_bytes(payload[:2], "big") >> 4
-    if len(payload) < _PLACE_BYTES.get(number, len(payload) + 1):
+    if len(payload) < PLACES.get(number, len(payload) + 1):
         return None
     bits = int.from_bytes(payload[:19], "big")
     raw = [bits >> shift & (1 << 38) - 1 for shift in (80, 40, 0)]

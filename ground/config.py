@@ -73,11 +73,36 @@ class TelemetryConfig:
     system: Annotated[int, Range(0, 255)] = 0
 
     def __post_init__(self) -> None:
-        if self.url and not re.fullmatch(r"/.+|(udp|tcp):[^:\s]*:\d{1,5}", self.url):
-            allowed = "a path, tcp:HOST:PORT, udp:HOST:PORT, or nothing"
-            raise ConfigError(f"telemetry.url is {self.url!r}; allowed: {allowed}")
-        if not _NAME.fullmatch(self.vehicle):
-            raise ConfigError(f"telemetry.vehicle is {self.vehicle!r}; allowed: 1 to 32 letters, digits, - and _")
+        _check_link("telemetry", self.url, self.vehicle)
+
+
+@dataclass(frozen=True)
+class CorrectionsConfig:
+    """A base station's receiver at the ground, which sends RTCM 3 (1005 or 1006, MSM4 to MSM7); off without a `url`.
+
+    `url` and `baud` are as for the telemetry, `vehicle` is the aircraft's name on the bus. `position` is latitude and
+    longitude, degrees, and height above the WGS84 ellipsoid, m, of the antenna where that was surveyed; empty: as the
+    receiver says.
+    """
+
+    url: str = ""
+    baud: Annotated[int, Range(300, 4_000_000)] = 115_200
+    vehicle: str = "uav1"
+    position: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_link("corrections", self.url, self.vehicle)
+        told = self.position
+        if told and not (len(told) == 3 and abs(told[0]) <= 90 and abs(told[1]) <= 360 and abs(told[2]) <= 10_000):
+            allowed = "latitude, longitude (degrees) and height (m above the ellipsoid), or nothing"
+            raise ConfigError(f"corrections.position is {list(told)}; allowed: {allowed}")
+
+
+def _check_link(section: str, url: str, vehicle: str) -> None:
+    if url and not re.fullmatch(r"/.+|(udp|tcp):[^:\s]*:\d{1,5}", url):
+        raise ConfigError(f"{section}.url is {url!r}; allowed: a path, tcp:HOST:PORT, udp:HOST:PORT, or nothing")
+    if not _NAME.fullmatch(vehicle):
+        raise ConfigError(f"{section}.vehicle is {vehicle!r}; allowed: 1 to 32 letters, digits, - and _")
 
 
 @dataclass(frozen=True)
@@ -90,6 +115,7 @@ class GroundConfig:
     store: StoreConfig = field(default_factory=StoreConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     telemetry: TelemetryConfig = field(default_factory=TelemetryConfig)
+    corrections: CorrectionsConfig = field(default_factory=CorrectionsConfig)
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.station):

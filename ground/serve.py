@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from common.bus import ZenohBus
 from common.clock import SystemClock
 from ground.config import GroundConfig
+from ground.corrections import CorrectionsNode
 from ground.gateway import Gateway
 from ground.station import Station
 from ground.store import Store
@@ -36,4 +37,8 @@ def running(config: GroundConfig) -> Iterator[Viewer | None]:
             telemetry = TelemetryNode(config.telemetry, bus, SystemClock())
             stack.callback(telemetry.close)
             telemetry.start()
+        if config.corrections.url:
+            corrections = CorrectionsNode(config.corrections, bus, SystemClock())
+            stack.callback(corrections.close)
+            corrections.start()
         yield viewer
