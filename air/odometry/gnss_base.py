@@ -9,12 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from air.gnss.ephemerides import Ephemerides
+from air.gnss.gnss_time import SECOND_NS
 from air.odometry.gnss_carrier import CarrierLocks
-from air.odometry.gnss_corrections import Signals
+from air.odometry.gnss_corrections import Signals, correct
 from air.odometry.gnss_settings import GnssSelection
 from common.arrays import F64, I64
+from common.measurements import GnssEpoch
 
 MAX_AGE_S = 10.0
+MOVED = 0.05
+"""A base that is so far away, m, from where it stood has moved."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +41,35 @@ class Differences:
 
 
 class BaseStation:
-    """Holds the newest residuals of a base at a known place (3,) m, ECEF."""
+    """Holds the newest residuals of a base that stays where it stands."""
 
-    def __init__(self, p_ecef: F64, settings: GnssSelection) -> None:
+    def __init__(self, settings: GnssSelection, p_ecef: F64 | None = None) -> None:
+        """`p_ecef` (3,) m is where it stands; without that, where its first epoch that tells a place says."""
         self.p_ecef = p_ecef
+        self.fault = ""
+        """Why its measurements are of no use, if they are not."""
         self._locks = CarrierLocks(settings)
         self._newest: _Residuals | None = None
 
-    def add(self, t_s: float, signals: Signals, lock_s: F64) -> None:
-        """Take the signals of an epoch at GPST `t_s` by the base's clock."""
-        arcs = self._locks.step(t_s, signals, lock_s)
-        ranges = signals.ranges(self.p_ecef)
+    def add(self, epoch: GnssEpoch, broadcast: Ephemerides) -> None:
+        """Take an epoch by the base's clock; one of an unknown place, or of another place than before, is refused."""
+        self.p_ecef = epoch.p_ecef if self.p_ecef is None else self.p_ecef
+        if self.p_ecef is None:
+            self.fault = "the base station has not said where it stands"
+            return
+        moved = 0.0 if epoch.p_ecef is None else float(np.linalg.norm(epoch.p_ecef - self.p_ecef))
+        if moved > MOVED:
+            # The world would jump along with it, and the map be torn.
+            self.fault = f"the base station has moved by {moved:.2f} m: put it back, or begin a new flight"
+            self._newest = None
+            return
+        self.fault = ""
+        self._take(epoch, correct(epoch, broadcast, self.p_ecef), self.p_ecef)
+
+    def _take(self, epoch: GnssEpoch, signals: Signals, p_ecef: F64) -> None:
+        t_s = epoch.t_ns / SECOND_NS
+        arcs = self._locks.step(t_s, signals, epoch.lock_s[signals.row])
+        ranges = signals.ranges(p_ecef)
         keys = list(zip(signals.satellites, signals.first.tolist(), strict=True))
         code = dict(zip(keys, (signals.code - ranges).tolist(), strict=True))
         carrier = zip(keys, (signals.carrier - ranges).tolist(), arcs.tolist(), strict=True)

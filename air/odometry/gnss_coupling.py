@@ -29,7 +29,7 @@ class GnssCoupling:
     """What GNSS is to the odometry of one flight. What satellites broadcast is kept whatever happens to the window."""
 
     def __init__(self, settings: GnssSettings, imu: ImuBuffer, flight: str, base: F64 | None = None) -> None:
-        """`base` (3,) m, ECEF, is where a base station stands, whose epochs come by `add_base`."""
+        """`base` (3,) m, ECEF, is where a base station stands, unless its epochs, which come by `add_base`, tell it."""
         self._settings, self._imu, self._flight = settings, imu, flight
         self._preprocessor = GnssPreprocessor(settings, base)
         self._lever = np.array(settings.p_body_antenna)
@@ -40,7 +40,6 @@ class GnssCoupling:
         self.start = GnssStart(settings, flight)
         self.datum: Datum | None = None
         self._used = (0, 0)
-        self._differential = base is not None
         self._anchor_sigma = 0.0
         self.why_not = "no epochs so far"
 
@@ -57,6 +56,11 @@ class GnssCoupling:
     def add_epoch(self, epoch: GnssEpoch) -> None:
         """Take an epoch of the receiver on board."""
         self._waiting.append(epoch)
+
+    @property
+    def base_fault(self) -> str:
+        """Why the measurements of the base station are of no use, if they are not."""
+        return self._preprocessor.base.fault
 
     def ready(self) -> list[CleanEpoch]:
         """The epochs that IMU samples cover by now, cleaned."""
@@ -103,7 +107,7 @@ class GnssCoupling:
     def join(self, window: Window, datum: Datum) -> None:
         """Be the companion of a window whose world is ENU at a datum."""
         self.datum, self.why_not = datum, ""
-        self._companion = GnssWindow(self._settings, self._imu, T_ecef_enu(datum), self._differential)
+        self._companion = GnssWindow(self._settings, self._imu, T_ecef_enu(datum))
         window.companion = self._companion
 
     def leave(self) -> None:
@@ -114,15 +118,15 @@ class GnssCoupling:
 
     def _add(self, window: Window, epoch: CleanEpoch) -> None:
         assert self._companion is not None
-        if self._is_anchored(window):
+        if self._is_anchored(window, epoch.differential):
             epoch = epoch.without_code()
         if self._companion.add(window, epoch):
             self._used = epoch.t_ns, int(np.sum(np.isfinite(epoch.code) | np.isfinite(epoch.rate)))
 
-    def _is_anchored(self, window: Window) -> bool:
+    def _is_anchored(self, window: Window, differential: bool) -> bool:
         """Whether pseudoranges have done their work and the position is still as well known."""
         sigma = float(np.sqrt(np.trace(window.pose_covariance[3:, 3:])))
-        if self._differential:
+        if differential:
             return sigma < SIGMA_CYCLES
         return sigma <= self._settings.reanchor * self._anchor_sigma
 

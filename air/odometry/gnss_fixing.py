@@ -13,6 +13,7 @@ import numpy as np
 from air.gnss.integers import find_integers
 from air.gnss.signals import LIGHT, PRIMARY, frequency
 from air.odometry.gnss_biases import BiasNode, Kind
+from air.odometry.gnss_preprocessing import DIFFERENTIAL
 from air.odometry.quadratic import Quadratic
 from common.arrays import F64
 
@@ -44,7 +45,7 @@ def _differences(node: BiasNode, variance: F64) -> tuple[F64, F64]:
     columns = [
         (name[0], column)
         for (kind, name), column in node.biases.items()
-        if kind is Kind.AMBIGUITY and name[0] in CODE_DIVISION
+        if kind is Kind.AMBIGUITY and name[0] in CODE_DIVISION and DIFFERENTIAL in name
     ]
     rows, wavelengths = [], []
     for system, group in groupby(sorted(columns), key=lambda one: one[0]):

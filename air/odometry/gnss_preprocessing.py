@@ -29,13 +29,15 @@ _UNTOLD = 3.0
 """Least sigma of a satellite's clock, m, where nobody tells by how much its signals are late."""
 _LEAST = 0.7
 _MIN_DIFFERENCES = 5
+DIFFERENTIAL = "-base"
 
 
 @dataclass(frozen=True, eq=False)
 class CleanEpoch:
     """One row for each of N satellites at GPST `t_ns`, the receiver's clock taken off.
 
-    `systems` (N,) names the clock of each, with "-base" when differences to a base station are taken; `p_satellite`,
+    `satellites` (N,) are named as in RINEX 3, `systems` (N,) by the clock of each; where differences to a base station
+    are taken, both end in "-base", for what spoils these is not what spoiled the ranges before. `p_satellite`,
     `v_satellite` (N, 3) are in ECEF at transmission. What models know is taken off `code`, `carrier` m and `rate` m/s
     (N,), all of which may be NaN. `arcs` (N,) names the unbroken carrier, empty where there is none. White noise is
     `sigma_code`, `sigma_carrier`, `sigma_rate` (N,); what stays for a while is `sigma_multipath` and `sigma_slow` (N,)
@@ -62,6 +64,11 @@ class CleanEpoch:
     offset: F64
     fix: PointPosition | None
 
+    @property
+    def differential(self) -> bool:
+        """Whether differences to a base station are taken."""
+        return any(name.endswith(DIFFERENTIAL) for name in self.systems)
+
     def without_code(self) -> CleanEpoch:
         """The epoch with its carriers and Dopplers alone."""
         return replace(self, code=np.full(len(self.satellites), np.nan))
@@ -71,7 +78,7 @@ class GnssPreprocessor:
     """Cleans the epochs of one receiver; keeps ephemerides, locks and its clock whatever happens elsewhere."""
 
     def __init__(self, settings: GnssSettings, base: F64 | None = None) -> None:
-        """`base` (3,) m, ECEF, is where a base station stands whose epochs come by `add_base`."""
+        """`base` (3,) m, ECEF, is where a base station stands whose epochs come by `add_base`, unless these tell it."""
         self._settings = settings
         selection = settings.selection
         self.broadcast = Ephemerides()
@@ -79,7 +86,7 @@ class GnssPreprocessor:
             elevation_mask_deg=selection.elevation_mask_deg, min_cn0=selection.min_cn0, exclude_outliers=True
         )
         self._locks = CarrierLocks(selection)
-        self._base = None if base is None else BaseStation(base, selection)
+        self.base = BaseStation(selection, base)
         self._seen: dict[str, tuple[int, int]] = {}
         self._codes: dict[str, tuple[int, float, float]] = {}
         self._fix: PointPosition | None = None
@@ -90,9 +97,7 @@ class GnssPreprocessor:
 
     def add_base(self, epoch: GnssEpoch) -> None:
         """Take an epoch of the base station."""
-        if self._base is not None:
-            signals = correct(epoch, self.broadcast, self._base.p_ecef)
-            self._base.add(epoch.t_ns / SECOND_NS, signals, epoch.lock_s[signals.row])
+        self.base.add(epoch, self.broadcast)
 
     def clean(self, epoch: GnssEpoch, near: F64 | None = None) -> CleanEpoch | Refused:
         """The believable rows of an epoch, or why there are none.
@@ -150,21 +155,21 @@ class GnssPreprocessor:
         known_rate = signals.sigma_rate(epoch) <= s.max_sigma_rate
         signals = replace(signals, rate=np.where(known_rate, signals.rate, np.nan))
         measured = _Measured(signals, arcs, _loudness(epoch.cn0[signals.row]))
-        if self._base is not None:
-            measured, usable = measured.minus(self._base.differences(epoch.t_ns / SECOND_NS, signals), usable)
+        measured, usable = measured.minus(self.base.differences(epoch.t_ns / SECOND_NS, signals), usable)
         second = {name: i for i, name in enumerate(signals.satellites) if not signals.first[i] and usable[i]}
         first = [i for i in range(len(signals.satellites)) if signals.first[i] and usable[i]]
         rows = [measured.of(i, second.get(signals.satellites[i])) for i in first]
         code, carrier, rate, sigma, sigma_carrier, bend, own = np.array([row[:7] for row in rows]).reshape(-1, 7).T
         elevation = signals.elevation[first]
-        systems = tuple(signals.clocks[i] + ("-base" if measured.differential else "") for i in first)
+        ending = DIFFERENTIAL if measured.differential else ""
+        systems = tuple(signals.clocks[i] + ending for i in first)
         glonass = np.array([name[0] == "R" for name in systems], bool)
         orbit = np.where(signals.told[first], noise.orbit, max(noise.orbit, _UNTOLD))
         air = np.hypot(noise.ionosphere * bend * signals.slant[first], noise.troposphere / np.sin(elevation))
         left = noise.differential if measured.differential else 1.0
         return CleanEpoch(
             t_ns=t_ns,
-            satellites=tuple(signals.satellites[i] for i in first),
+            satellites=tuple(signals.satellites[i] + ending for i in first),
             systems=systems,
             p_satellite=signals.p_satellite[first],
             v_satellite=signals.v_satellite[first],
@@ -234,7 +239,7 @@ class _Measured:
         if self.arcs[i] < 0:
             return code, np.nan, rate, sigma, np.nan, bend, 1.0, ""
         if self.base_arcs is not None:
-            arc = f"{name}/{self.arcs[i]}-{self.base_arcs[i]}"
+            arc = f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base_arcs[i]}"
             return code, float(s.carrier[i]), rate, sigma, float(loud[0]), bend, 0.0, arc
         if j is None or self.arcs[j] < 0:
             return code, float(s.carrier[i]), rate, sigma, float(loud[0]), bend, 1.0, f"{name}/{self.arcs[i]}"

@@ -66,10 +66,8 @@ class _Stretch:
 class GnssWindow:
     """A companion of the window. Add epochs in order of time."""
 
-    def __init__(self, settings: GnssSettings, imu: ImuBuffer, T_ecef_world: SE3, differential: bool = False) -> None:
-        """`differential` says that ranges are differences to a base station's: these drift so little that carriers do
-        tell the place."""
-        self._differential = differential
+    def __init__(self, settings: GnssSettings, imu: ImuBuffer, T_ecef_world: SE3) -> None:
+        self._differential = False
         self._lines: dict[str, tuple[int, F64]] = {}
         self._settings, self._imu, self._T_ecef_world = settings, imu, T_ecef_world
         self._lever = np.array(settings.p_body_antenna)
@@ -87,6 +85,8 @@ class GnssWindow:
         way = self._imu.between(keyframe.t_ns, epoch.t_ns)
         if way.doubtful.any():
             return False
+        # Differences to a base station drift so little that their carriers do tell the place.
+        self._differential = epoch.differential
         if not self._differential:
             epoch = self._renewed(epoch)
         stretch = self._stretch(window.values, keyframe.k, epoch)
@@ -184,7 +184,7 @@ class GnssWindow:
         measured = window.preintegrator.integrate(way, bias)
         omega = self._imu.between(epoch.t_ns - GYRO_NS, epoch.t_ns).rate
         p_world = window.values.atPose3(X(keyframe.k)).translation()
-        line = None if self._differential else self._line_carrier(epoch, p_world)
+        line = None if epoch.differential else self._line_carrier(epoch, p_world)
         return _Taken(epoch, measured, omega, line)
 
     def _linearised(self, values: gtsam.Values, stretch: _Stretch, taken: Sequence[_Taken]) -> Quadratic:
