@@ -146,13 +146,13 @@ def _run(args: argparse.Namespace) -> int:
     log.setup()
     config = load(args.config, AirConfig)
     url = args.source or config.source
-    if url.startswith(("live:", "sim:")) and not url.startswith("sim:survey"):
-        from air.sensing import sense
+    if url.startswith(("photos:", "sim:survey")):
+        from air.nodes import fly
 
-        return sense(config, url)
-    from air.nodes import fly
+        return fly(config, url)
+    from air.sensing import sense
 
-    return fly(config, url)
+    return sense(config, url)
 
 
 def _position(args: argparse.Namespace) -> int:

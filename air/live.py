@@ -27,7 +27,10 @@ SETTLED = 5
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """What a step changed: keyframes and tiles, new or at a higher revision, and the poses of newly placed photos."""
+    """What a step changed: keyframes and tiles, new or at a higher revision, and the poses of newly placed photos.
+
+    Photos that the odometry placed tell no poses: it does.
+    """
 
     keyframes: list[Keyframe]
     tiles: list[MapTile]
@@ -54,12 +57,15 @@ class LiveMap:
         self._alignment.datum = datum
         self._mapper = Mapper(config.mapping)
         self._photos = 0
+        self._navigated: set[int] = set()
 
     def align(self, photo: PreparedPhoto) -> list[Keyframe]:
         """The keyframes that one more photo adds or moves."""
         keyframes = self._alignment.add(photo)
         if photo.image is not None:
             self._mapper.add_image(self._photos, photo.image)
+        if photo.photo.revision is not None:
+            self._navigated.add(self._photos)
         self._photos += 1
         return keyframes
 
@@ -70,7 +76,8 @@ class LiveMap:
     def grow(self, keyframes: list[Keyframe]) -> Growth:
         """What these keyframes add to the map, and the poses of the new ones; what they move is left for later."""
         tiles = self._mapper.update(self._flight, keyframes, self._alignment.ground_height(), moves=0)
-        return Growth(keyframes, tiles, [self._pose(k) for k in keyframes if k.revision == 1])
+        new = [k for k in keyframes if k.revision == 1 and k.index not in self._navigated]
+        return Growth(keyframes, tiles, [self._pose(k) for k in new])
 
     def correct(self, in_flight: bool) -> list[MapTile]:
         """Tiles of some of the surfaces that moved and were left for later, in flight few; empty once none is left."""

@@ -15,7 +15,6 @@ from air.flight import flight_now
 from air.jump import Jump
 from air.live import LiveMap
 from air.preparation import prepared
-from air.sources.navigated import Navigated
 from air.sources.source import PhotoSource, open_photos
 from air.uplink.uplink import Uplink
 from air.warm_up import warm_up
@@ -39,12 +38,7 @@ def fly(config: AirConfig, url: str | None = None) -> int:
     Raises SourceError, also when the source fails on the way, and BusError.
     """
     stop = threading.Event()
-    source = open_photos(
-        url or config.source,
-        config.pace,
-        photos_of=lambda source: Navigated(source, config.odometry),
-        sleep=_sleep_until(stop),
-    )
+    source = open_photos(url or config.source, config.pace, sleep=_sleep_until(stop))
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     return _fly(config, flight_now(), None, source, stop)

@@ -16,7 +16,7 @@ from common.errors import BusError, WireError
 from common.keys import message_key
 from common.measurements import CameraFrame, Measurement
 from common.messages import Datum, EstimatorState, Health, Keyframe, Level, Message, Mode, Photo, Pose
-from common.streams import DATUM, ESTIMATOR, HEALTH, POSE, Stream
+from common.streams import DATUM, ESTIMATOR, HEALTH, POSE, POSE_IMU, Stream
 from common.wire import encode
 
 log = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ BEAT_S = 1.0
 
 
 class OdometryNode:
-    """Measurements in; poses at the rate of their stream, the estimator's state and photos out."""
+    """Measurements in; poses at the rates of their streams, the estimator's state and photos out."""
 
     def __init__(
         self,
@@ -88,12 +88,16 @@ class OdometryNode:
         text = str(self._mode)
         if behind:
             text += f"; {dropped - self._dropped} frames were dropped: this computer does not keep up"
-        level = Level.DEGRADED if behind or self._mode is Mode.INERTIAL else Level.OK
+        if fault := self._navigator.odometry.estimator.gnss.base_fault:
+            text += f"; {fault}"
+        level = Level.DEGRADED if behind or fault or self._mode is Mode.INERTIAL else Level.OK
         counts = {"frames": self._frames, "dropped": dropped, "delay_ms": round(1000 * self._slowest_s)}
         self._dropped, self._slowest_s = dropped, 0.0
         self._publish(HEALTH, Health(self._clock.now_ns(), ROLE, level, text, counts))
 
     def _send(self, pose: Pose) -> None:
+        """On board at the rate of the IMU, by radio as often as its stream says and at once after a jump."""
+        self._publish(POSE_IMU, pose)
         if pose.revision == self._posed_revision and pose.t_ns - self._posed_ns < 0.99e9 / POSE.rate_hz:
             return
         self._posed_ns, self._posed_revision = pose.t_ns, pose.revision

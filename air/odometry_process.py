@@ -49,11 +49,16 @@ class OdometryProcess:
         # It listens nowhere: that is the place of the node of the devices.
         self._config, self._known = replace(config, bus=replace(config.bus, listen=())), known
         self._process = _Process(self._config, self._known)
+        self._lock = threading.Lock()
 
     def take(self, measurement: Measurement) -> None:
         """Hand a measurement on; a frame for which there is no room is dropped and counted. Returns at once."""
         if isinstance(measurement, RawBytes | ClockState):
             return
+        with self._lock:  # those of a base station come on the bus's thread
+            self._take(measurement)
+
+    def _take(self, measurement: Measurement) -> None:
         if self._process.exitcode is not None:
             if time.monotonic() - self._process.begun_s < AGAIN_S:
                 return

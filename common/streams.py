@@ -66,6 +66,7 @@ class Stream:
 
 
 POSE = Stream("pose", Pose, 10.0, Priority.REAL_TIME, Congestion.DROP, Radio.BOTH, 1_000, 1.0, express=True)
+POSE_IMU = Stream("pose/imu", Pose, 200.0, Priority.REAL_TIME, Congestion.DROP, Radio.LOCAL, 1_000, 0.5, express=True)
 DATUM = Stream("datum", Datum, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 1_000, 5.0)
 HEALTH = Stream("health", Health, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 4_000, 5.0, keyed=True)
 DIGEST = Stream("map/digest", MapDigest, 1.0, Priority.DATA_HIGH, Congestion.DROP, Radio.BOTH, 256_000, 5.0)
@@ -99,7 +100,7 @@ _PICTURES = (Priority.BACKGROUND, Congestion.BLOCK, Radio.LOCAL)
 RAW_CAMERA = Stream("raw/camera", CameraFrame, 30.0, *_PICTURES, 8_000_000, 1.0, keyed=True)
 
 STREAMS: tuple[Stream, ...] = (
-    *(POSE, DATUM, HEALTH, DIGEST, KEYFRAME, ESTIMATOR, TILE, TILE_REQUEST),
+    *(POSE, POSE_IMU, DATUM, HEALTH, DIGEST, KEYFRAME, ESTIMATOR, TILE, TILE_REQUEST),
     *(VEHICLE, CLOCK, RTCM),
     *(RAW_IMU, RAW_GNSS, RAW_EPHEMERIS, RAW_GLONASS, RAW_IONOSPHERE, RAW_SOLUTION, RAW_BYTES, RAW_CAMERA),
 )

@@ -40,7 +40,7 @@ from common.measurements import CameraFrame, Encoding, FixKind, ImuSample, Recei
 from common.messages import Datum, Health, Level, Mode, Photo, Pose
 from common.se3 import SE3, rotation_angle
 from common.streams import DATUM as DATUM_STREAM
-from common.streams import HEALTH, POSE, Stream
+from common.streams import HEALTH, POSE, POSE_IMU, Stream
 from common.wire import decode
 
 ROOT = Path(__file__).parents[1]
@@ -85,9 +85,15 @@ def navigator(flown: GnssFlight) -> Navigator:
 
 
 @pytest.fixture(scope="module")
-def told(navigator: Navigator, flown: GnssFlight) -> list[Output | Photo]:
+def told_each(navigator: Navigator, flown: GnssFlight) -> list[list[Output | Photo]]:
+    """What it tells at each measurement."""
+    return [navigator.feed(measurement) for measurement in sensed(flown)]
+
+
+@pytest.fixture(scope="module")
+def told(told_each: list[list[Output | Photo]]) -> list[Output | Photo]:
     """All that it tells."""
-    return [told for measurement in sensed(flown) for told in navigator.feed(measurement)]
+    return [told for each in told_each for told in each]
 
 
 def test_a_photo_was_taken_where_the_odometry_says(flown: GnssFlight, told: list[Output | Photo]) -> None:
@@ -212,16 +218,22 @@ class _Bus:
         self.sent.append((stream, payload))
 
 
-def test_poses_go_out_at_the_rate_of_their_stream_and_photos_to_the_mapper(flown: GnssFlight) -> None:
+def test_poses_go_out_at_the_rates_of_their_streams_and_photos_to_the_mapper(
+    flown: GnssFlight, told_each: list[list[Output | Photo]]
+) -> None:
     bus, photos = _Bus(), list[tuple[Photo, Datum]]()
     node = OdometryNode(AirConfig(), known_of(flown), "flight", bus, lambda *taken: photos.append(taken))  # type: ignore[arg-type]
+    again = iter(told_each)
+    node._navigator = SimpleNamespace(feed=lambda _: next(again))  # type: ignore[assignment]
     for measurement in sensed(flown):
         node.take(measurement)  # type: ignore[arg-type]
     node.beat(0)
     count = Counter(stream.name for stream, _ in bus.sent)
-    poses = [decode(Pose, payload) for stream, payload in bus.sent if stream is POSE]
-    spaces_s = np.diff([pose.t_ns for pose in poses]) * 1e-9
-    assert np.median(spaces_s) == pytest.approx(1 / POSE.rate_hz, abs=0.006)
+    for wanted in (POSE, POSE_IMU):
+        poses = [decode(Pose, payload) for stream, payload in bus.sent if stream is wanted]
+        spaces_s = np.diff([pose.t_ns for pose in poses]) * 1e-9
+        # As many as there are samples of the IMU, which come 5 ms apart.
+        assert np.median(spaces_s) == pytest.approx(1 / wanted.rate_hz, abs=0.006 if wanted is POSE else 1e-4)
     assert count[DATUM_STREAM.name] == 2  # found, and the beat
     assert len({datum for _, datum in photos}) == 1
     assert len(photos) >= 4
