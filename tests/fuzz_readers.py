@@ -27,12 +27,14 @@ from ubx_samples import EPOCH, SOLUTION, STREAM
 
 from air.gnss import beidou_d1_d2, glonass_strings, inav, lnav
 from air.gnss.bits import split
+from air.gnss.msm_writer import MsmWriter
 from air.gnss.precise_orbit import read_sp3
 from air.gnss.rinex_lines import Lines
 from air.gnss.rinex_navigation import read_navigation
 from air.gnss.rinex_observation import read_observations
 from air.sensors import ubx, xbus
 from air.sensors.driver import Driver
+from air.sensors.gnss_rtcm import RtcmReceiver
 from air.sensors.gnss_ublox import UbloxReceiver
 from air.sensors.imu_xsens import XsensImu
 from air.sensors.mavlink import MavlinkVehicle
@@ -128,7 +130,20 @@ def _rtcm(data: bytes) -> None:
     assert len(out) + passing.counts.dropped_bytes <= passing.counts.received_bytes == len(data)
 
 
+def _msm(data: bytes) -> None:
+    """The bytes as messages of a base station in frames that are whole."""
+    driver = RtcmReceiver(near_ns=SENT_NS)
+    for number in (1005, 1006, 1074, 1085, 1096, 1117, 1127):
+        driver.feed(rtcm.frame(bytes([number >> 4, (number & 15) << 4 | data[0] & 15 if data else 0]) + data[1:900]), 0)
+
+
+def _base_seeds() -> list[bytes]:
+    return [b"".join(map(rtcm.frame, MsmWriter().messages(EPOCH)))]
+
+
 _GNSS = (
+    of_driver("base", lambda: RtcmReceiver(near_ns=SENT_NS), _base_seeds),
+    Reader("msm", _msm, lambda: [message[1:] for message in MsmWriter().messages(EPOCH)]),
     of_driver("ubx", UbloxReceiver, _ubx_seeds),
     Reader("ubx messages", _ubx_messages, _ubx_payloads),
     Reader("navigation bits", _navigation_bits, lambda: [bytes(range(250)), bytes(400)]),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
 from air.gnss.positioning import Refused
+from air.odometry.gnss_base import MAX_AGE_S
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
 from air.odometry.gnss_settings import GnssSelection, GnssSettings
 from air.sources.simulated.gnss.antenna import fixed_antenna
@@ -26,7 +27,7 @@ from air.sources.source import open_source
 from common.arrays import F64
 from common.measurements import GnssEpoch, KeplerEphemeris
 
-PERFECT = GnssOptions.perfect()
+PERFECT, DEFAULT = GnssOptions.perfect(), GnssOptions()
 
 
 def preprocessor(options: GnssOptions = PERFECT, base: F64 | None = None, carrier: bool = True) -> GnssPreprocessor:
@@ -154,6 +155,50 @@ def test_a_base_takes_off_what_both_have() -> None:
     assert np.abs(spread(apart, apart.code)).max() > 1.0
     assert np.abs(spread(both, both.code)).max() < 0.05
     assert both.sigma_slow.max() < 0.1 * apart.sigma_slow.max()
+
+
+def heard(base: list[GnssEpoch], seconds: float) -> tuple[GnssPreprocessor, list[tuple[float, bool]]]:
+    """A receiver's seconds, and whether differences were taken, with a base that nothing is known of beforehand."""
+    cleaner, found = preprocessor(DEFAULT), list[tuple[float, bool]]()
+    for o in rover(replace(DEFAULT, rate_hz=1.0), seconds).observations():
+        for epoch in base:
+            if 0 <= o.epoch.t_ns - epoch.t_ns < SECOND_NS:
+                cleaner.add_base(epoch)
+        clean = cleaner.clean(o.epoch)
+        found += [(round(o.t_s), clean.differential)] if isinstance(clean, CleanEpoch) else []
+    return cleaner, found
+
+
+def standing(seconds: float) -> list[GnssEpoch]:
+    above, options = sky(DEFAULT), GnssOptions.base()
+    antenna = fixed_antenna(BASE_WORLD, DATUM)
+    base = SimulatedReceiver("base", antenna, above, options, 1, seconds, BASE_STATION)
+    return [replace(o.epoch, t_ns=round(o.epoch.t_ns, -6), p_ecef=BASE_ECEF) for o in base.observations()]
+
+
+def test_differences_begin_when_a_base_says_where_it_stands_and_end_when_it_falls_silent() -> None:
+    told = standing(20.0)
+    untold = [replace(epoch, p_ecef=None) for epoch in told[2:5]]
+    cleaner, found = heard([*untold, *told[5:8], *(replace(epoch, p_ecef=None) for epoch in told[8:10])], 30.0)
+    assert found
+    for t_s, differential in found:
+        if t_s != 9 + MAX_AGE_S:  # the receiver's clock decides
+            assert differential == (5 <= t_s < 9 + MAX_AGE_S)
+    assert cleaner.base.fault == ""
+    waiting, found = heard(untold, 8.0)
+    assert "has not said where it stands" in waiting.base.fault
+    assert not any(differential for _, differential in found)
+
+
+def test_a_base_that_moves_is_refused_until_it_is_back() -> None:
+    told = standing(12.0)
+    moved = [replace(epoch, p_ecef=BASE_ECEF + (0.0, 1.5, 2.0)) for epoch in told[5:8]]
+    cleaner, found = heard([*told[:5], *moved], 9.0)
+    assert cleaner.base.fault == "the base station has moved by 2.50 m: put it back, or begin a new flight"
+    assert [differential for _, differential in found] == [t_s < 5 for t_s, _ in found]
+    cleaner, found = heard([*told[:5], *moved, *told[8:]], 11.0)
+    assert cleaner.base.fault == ""
+    assert found[-1][1]
 
 
 def test_ranges_of_satellites_that_tell_no_group_delay_are_worth_less() -> None:

@@ -64,6 +64,8 @@ class BaseStation:
             self._newest = None
             return
         self.fault = ""
+        if self._newest is not None and 0.0 <= self._newest.t_s - epoch.t_ns / SECOND_NS < MAX_AGE_S:
+            return  # it came twice, or late: carriers go forwards
         self._take(epoch, correct(epoch, broadcast, self.p_ecef), self.p_ecef)
 
     def _take(self, epoch: GnssEpoch, signals: Signals, p_ecef: F64) -> None:

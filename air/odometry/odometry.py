@@ -98,8 +98,7 @@ class Odometry:
         if isinstance(message, ReceiverSolution):
             self._learn(message)
         elif isinstance(message, GnssEpoch):
-            gnss = self.estimator.gnss
-            gnss.add_base(message) if message.receiver == BASE else gnss.add_epoch(message)
+            self._hear_base(message) if message.receiver == BASE else self.estimator.gnss.add_epoch(message)
         else:
             self.estimator.gnss.add(message)
         return []
@@ -125,6 +124,13 @@ class Odometry:
             sigma = solution.sigma_velocity if np.isfinite(solution.sigma_velocity) else UNKNOWN_SIGMA_SPEED
             speed = float(np.linalg.norm(np.nan_to_num(solution.v_enu)))  # some tell nothing about the vertical
             self.estimator.add_speed(KnownSpeed(solution.t_ns, speed, max(sigma, MIN_SIGMA_SPEED)))
+
+    def _hear_base(self, epoch: GnssEpoch) -> None:
+        gnss = self.estimator.gnss
+        well = not gnss.base_fault
+        gnss.add_base(epoch)
+        if gnss.base_fault and well:
+            self.notes.append((epoch.t_ns, gnss.base_fault))
 
     def _frames(self) -> list[Output]:
         """What the waiting frames tell that IMU samples cover by now."""
