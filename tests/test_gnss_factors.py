@@ -15,6 +15,7 @@ from air.odometry.gnss_biases import BiasNode, Kind, first_node, needed, next_no
 from air.odometry.gnss_factors import STATES, AntennaMotion, antenna_motion, linearise
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssNoise
+from air.odometry.mounting import ANTENNA, COLUMNS, MOUNTING
 from air.odometry.quadratic import Quadratic
 from common.arrays import F64
 from common.geo import T_ecef_enu
@@ -41,14 +42,14 @@ IMU_BIAS = gtsam.imuBias.ConstantBias(np.array([0.05, -0.02, 0.03]), np.array([0
 
 
 def moved(delta: F64) -> AntennaMotion:
-    """The antenna after a small change of the keyframe's 15 columns."""
-    bias = IMU_BIAS.vector() + delta[9:]
+    """The antenna after a small change of the columns of keyframe and mounting."""
+    bias = IMU_BIAS.vector() + delta[9:15]
     return antenna_motion(
         POSE.retract(delta[:6]),
         VELOCITY + delta[6:9],
         gtsam.imuBias.ConstantBias(bias[:3], bias[3:]),
         WAY,
-        LEVER,
+        LEVER + delta[15:][ANTENNA],
         OMEGA,
     )
 
@@ -127,10 +128,10 @@ def test_a_true_state_leaves_no_residual_whatever_the_clock_shows() -> None:
 
 
 def test_the_factor_finds_the_state_that_the_measurements_were_made_with() -> None:
-    """Fifteen columns are more than one epoch tells: only what it tells must come out."""
+    """So many columns are more than one epoch tells: only what it tells must come out."""
     rng = np.random.default_rng(1)
     delta = np.concatenate(
-        [0.002 * rng.standard_normal(3), rng.standard_normal(3), 0.1 * rng.standard_normal(3), np.zeros(6)]
+        [0.002 * rng.standard_normal(3), rng.standard_normal(3), 0.1 * rng.standard_normal(3), np.zeros(STATES - 9)]
     )
     biases = np.zeros(8)
     truth = moved(delta)
@@ -164,7 +165,12 @@ def test_one_wild_code_hardly_counts() -> None:
 def known_at(values: gtsam.Values, node: BiasNode, epoch: CleanEpoch, motion: AntennaMotion, u: F64) -> Quadratic:
     linear = linearise(epoch, motion, node, u, T_ECEF_WORLD, np.inf)
     X, V, B = (gtsam.symbol(letter, 0) for letter in "xvb")
-    return Quadratic({X: POSE, V: VELOCITY, B: IMU_BIAS.vector(), node.key: u}, linear.G, linear.g, linear.f)
+    return Quadratic(
+        {X: POSE, V: VELOCITY, B: IMU_BIAS.vector(), MOUNTING: np.zeros(COLUMNS), node.key: u},
+        linear.G,
+        linear.g,
+        linear.f,
+    )
 
 
 def values_of(node: BiasNode, u: F64, pose: gtsam.Pose3 = POSE) -> gtsam.Values:
@@ -172,6 +178,7 @@ def values_of(node: BiasNode, u: F64, pose: gtsam.Pose3 = POSE) -> gtsam.Values:
     values.insert(gtsam.symbol("x", 0), pose)
     values.insert(gtsam.symbol("v", 0), VELOCITY)
     values.insert(gtsam.symbol("b", 0), IMU_BIAS)
+    values.insert(MOUNTING, np.zeros(COLUMNS))
     values.insert(node.key, u)
     return values
 
@@ -183,7 +190,7 @@ def test_seen_from_elsewhere_it_says_the_same() -> None:
     known = known_at(values_of(node, u), node, epoch, motion, u)
     shift = np.array([0.2, -0.1, 0.3])
     later = values_of(node, u + 0.5, gtsam.Pose3(POSE.rotation(), POSE.translation() + POSE.rotation().rotate(shift)))
-    delta = np.concatenate([[0, 0, 0], shift, np.zeros(9), np.full(len(node), 0.5)])
+    delta = np.concatenate([[0, 0, 0], shift, np.zeros(STATES - 6), np.full(len(node), 0.5)])
     expected = (known.f - 2 * known.g @ delta + delta @ known.G @ delta) / 2
     assert known.error(later) == pytest.approx(expected, rel=1e-6)
     assert known.at(later).f / 2 == pytest.approx(expected, rel=1e-6)

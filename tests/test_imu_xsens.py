@@ -61,7 +61,9 @@ def test_every_sample_of_the_recording_equals_a_second_reading(recording: bytes)
     assert len(samples) == len(rows) == 4746
     np.testing.assert_array_equal([s.accel for s in samples], rows["accel"])
     np.testing.assert_array_equal([s.gyro for s in samples], rows["gyro"])
-    np.testing.assert_array_equal([s.t_ns for s in samples], rows["ticks"].astype(np.int64) * TICK_NS)
+    half_ns = int(np.diff(rows["ticks"]).min()) * TICK_NS // 2
+    stamps = rows["ticks"].astype(np.int64) * TICK_NS - half_ns  # a sample is the mean over the period before it
+    np.testing.assert_array_equal([s.t_ns for s in samples][1:], stamps[1:])
     q = np.array([s.q_enu_body for s in samples])
     np.testing.assert_allclose(np.abs(np.sum(q * rows["q"], axis=1)), 1.0, atol=1e-6)  # float32, then normalised
     assert not any(s.saturated for s in samples)
@@ -180,7 +182,7 @@ def test_stamps_run_on_over_a_wrap_of_the_counter_and_missing_messages_are_count
     start, counters = 2**32 - 120, [65534, 65535, 0, 3, 4]
     data = b"".join(message(c, start + 50 * ((c + 2) % 2**16)) for c in counters)
     stamps = [s.t_ns // TICK_NS - start for s in samples_of(data, driver=driver)]
-    assert stamps == [0, 50, 100, 250, 300]
+    assert stamps == [-25, 25, 75, 225, 275]  # the middle of each period
     assert driver.counts.missing == 2
     assert driver.scale is TimeScale.DEVICE
 
@@ -188,8 +190,8 @@ def test_stamps_run_on_over_a_wrap_of_the_counter_and_missing_messages_are_count
 def test_coarse_seconds_and_fine_ticks_make_one_time() -> None:
     data = b"".join(message(i, 4_009_950 + 50 * i, SAMPLE_TIME_COARSE=(700 + i,)) for i in (0, 1))
     first, second = samples_of(data)
-    assert first.t_ns == 700_995_000_000
-    assert second.t_ns == 701_000_000_000
+    assert first.t_ns == 700_992_500_000
+    assert second.t_ns == 700_997_500_000
 
 
 def test_a_sample_without_time_or_with_nonsense_is_refused() -> None:

@@ -141,7 +141,7 @@ def test_rows_exposed_one_after_the_other_are_moved_to_one_time() -> None:
         p_cam = T_world_cam.inverse().apply(scene.points)
         there = CAMERA.fx * p_cam[p_cam[:, 2] > 0, :2] / p_cam[p_cam[:, 2] > 0, 2:]
         raw = CAMERA.fx * frame.rays[:, :2] / frame.rays[:, 2:]
-        for xy, before in zip(ideal.values(), raw, strict=True):
+        for xy, before in zip(ideal.xy, raw[np.argsort(frame.ids)], strict=True):
             moved.append(np.linalg.norm(there - xy, axis=1).min())
             unmoved.append(np.linalg.norm(there - before, axis=1).min())
     # The body trembles within the 22 ms of a frame, and the ground is not flat: a tenth of a pixel.

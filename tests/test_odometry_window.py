@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ from gtsam.symbol_shorthand import B, L, V, X
 from odometry_scene import CAMERA, T_BODY_CAM, Scene
 
 from air.odometry.initial_prior import Sigmas
+from air.odometry.mounting import Mounted, Mounting, MountingSettings
 from air.odometry.preintegration import ImuBuffer
 from air.odometry.quadratic import NormalEquations, dimension
 from air.odometry.settings import ImuSettings, WindowSettings
+from air.odometry.sightings import Seen
 from air.odometry.tracker import TrackedFrame
 from air.odometry.window import Window
 from air.sources.simulated.imu import ImuOptions
@@ -21,10 +25,13 @@ from common.measurements import ImuSample
 
 KNOWN = Sigmas(tilt=0.005, yaw=1e-4, position=1e-3, velocity=0.05, accel_bias=0.03, gyro_bias=0.003)
 IMU = ImuSettings()
+EXACT = Mounted.beforehand(Mounting(T_BODY_CAM), MountingSettings(camera_deg=0, camera_m=0, delay_s=0, antenna_m=0))
 
 
-def ideal(frame: TrackedFrame) -> dict[int, F64]:
-    return {int(i): CAMERA.fx * ray[:2] / ray[2] for i, ray in zip(frame.ids, frame.rays, strict=True)}
+def ideal(frame: TrackedFrame) -> Seen:
+    order = np.argsort(frame.ids)
+    rays = frame.rays[order]
+    return Seen(frame.ids[order], CAMERA.fx * rays[:, :2] / rays[:, 2:], np.zeros((len(rays), 2)))
 
 
 def flown(
@@ -34,7 +41,7 @@ def flown(
     observations."""
     scene = Scene(seed, duration_s, FlightOptions(start="air"), ImuOptions())
     buffer, rng = ImuBuffer(IMU), np.random.default_rng(seed)
-    window = Window(CAMERA.fx, T_BODY_CAM, buffer, settings or WindowSettings(), IMU)
+    window = Window(CAMERA.fx, EXACT, buffer, settings or WindowSettings(), IMU)
     estimate, truth, waiting = [], [], []
     for message in scene.sensed():
         if isinstance(message, ImuSample):
@@ -43,15 +50,14 @@ def flown(
             waiting.append(message)
         while waiting and buffer.covers(waiting[0].t_ns, waiting[0].t_ns) and len(estimate) < stop_after:
             frame = waiting.pop(0)
-            xy = ideal(frame)
-            for i in xy:
-                if rng.random() < spoil:
-                    xy[i] = xy[i] + rng.uniform(-60, 60, 2)
+            seen = ideal(frame)
+            wild = rng.random(len(seen.ids)) < spoil
+            seen = replace(seen, xy=seen.xy + wild[:, None] * rng.uniform(-60, 60, seen.xy.shape))
             if not window.frames:
                 state = scene.state(frame.t_ns)
-                window.begin(state, KNOWN.covariance(state.T_world_body.R), xy)
+                window.begin(state, KNOWN.covariance(state.T_world_body.R), seen)
                 continue
-            window.add(frame.t_ns, xy)
+            window.add(frame.t_ns, seen)
             assert not window.solve().failed
             estimate.append(window.state().T_world_body.t)
             truth.append(scene.state(frame.t_ns).T_world_body.t)
@@ -83,7 +89,7 @@ def test_the_window_stays_small_and_the_buffer_too() -> None:
     window, _, _, _ = flown(1, 12.0, WindowSettings(keyframes=6))
     assert len(window.frames) <= 7
     keys = {gtsam.Symbol(key).string() for key in window.values.keys()}  # noqa: SIM118
-    assert len(keys) == 3 * len(window.frames) + len(window.points)
+    assert len(keys) == 3 * len(window.frames) + len(window.points) + 1  # and the mounting
     assert window.state(0).t_ns > window.state().t_ns - 10_000_000_000
 
 
@@ -91,7 +97,7 @@ def test_nothing_seen_leaves_the_imu() -> None:
     window, scene, _, _ = flown(1, 6.0, stop_after=30)
     begin_ns = window.state().t_ns
     for k in range(1, 11):
-        window.add(begin_ns + k * 100_000_000, {})
+        window.add(begin_ns + k * 100_000_000, Seen.nothing())
         assert not window.solve().failed
         window.slide()
     truth = scene.state(window.state().t_ns)
@@ -101,8 +107,9 @@ def test_nothing_seen_leaves_the_imu() -> None:
 def test_a_point_without_parallax_is_removed_and_not_the_flight() -> None:
     window, _, _, _ = flown(1, 4.0)
     newest = window.frames[-1]
-    lonely = max(newest.xy) + 1
-    newest.xy[lonely] = np.zeros(2)
+    lonely = int(newest.seen.ids.max()) + 1
+    seen, nothing = newest.seen, np.zeros((1, 2))
+    newest.seen = Seen(np.append(seen.ids, lonely), np.vstack([seen.xy, nothing]), np.vstack([seen.rate, nothing]))
     window.values.insert(L(lonely), np.array([1e9, 0.0, 0.0]))
     window.points.add(lonely)  # nothing but its weak prior holds it
     assert not window.solve().failed
@@ -112,9 +119,9 @@ def test_a_point_without_parallax_is_removed_and_not_the_flight() -> None:
 def test_a_frame_that_shows_nothing_new_is_dropped_and_its_imu_kept() -> None:
     window, _, _, _ = flown(1, 4.0)
     count, newest_ns = len(window.frames), window.state().t_ns
-    seen = dict(window.frames[-1].xy)
+    seen = window.frames[-1].seen
     for k in (1, 2, 3):
-        window.add(newest_ns + k * 20_000_000, dict(seen))
+        window.add(newest_ns + k * 20_000_000, seen)
         window.slide()
     assert len(window.frames) <= count + 1
     spans = [f.motion.deltaTij() for f in window.frames[1:]]
@@ -126,7 +133,7 @@ def test_moving_the_window_moves_everything_in_it() -> None:
     scene = Scene(1, 3.0, FlightOptions(start="air"), ImuOptions())
     buffer = ImuBuffer(IMU)
     frames = [m for m in scene.sensed() if not isinstance(m, ImuSample) or not buffer.add(m)]
-    window = Window(CAMERA.fx, T_BODY_CAM, buffer, WindowSettings(), IMU)
+    window = Window(CAMERA.fx, EXACT, buffer, WindowSettings(), IMU)
     first = scene.state(frames[0].t_ns)  # type: ignore[union-attr]
     window.begin(first, KNOWN.covariance(first.T_world_body.R), ideal(frames[0]))  # type: ignore[arg-type]
     for frame in frames[4:24:4]:
@@ -158,11 +165,13 @@ def test_the_marginal_prior_is_the_schur_complement() -> None:
     H, g = linear.hessian(gtsam.Ordering(keys))
     equations = NormalEquations(dict.fromkeys(keys, 6))
     equations.add(keys, H, g)
-    prior = equations.without([X(0)], values)
+    prior, conditional = equations.without([X(0)], values)
     rest = linear.eliminatePartialSequential(gtsam.Ordering([X(0)]))[1]
     expected, expected_g = rest.hessian(gtsam.Ordering([X(1), X(2)]))
     np.testing.assert_allclose(prior.G, expected, atol=1e-9 * np.abs(expected).max())
     np.testing.assert_allclose(prior.g, expected_g, atol=1e-9 * np.abs(expected_g).max())
+    whole = np.linalg.solve(H, g)  # what left follows from the others
+    np.testing.assert_allclose(conditional.shift - conditional.by @ whole[6:], whole[:6], atol=1e-9)
 
 
 def test_the_newest_covariance_is_the_marginal_of_the_whole_window() -> None:
@@ -170,9 +179,16 @@ def test_the_newest_covariance_is_the_marginal_of_the_whole_window() -> None:
     window, _, _, _ = flown(2, 4.0)
     window.solve()
     newest, values = window.frames[-1].k, window.values
-    keys = window._graph().keyVector()
-    H = window._graph().linearize(values).hessian(gtsam.Ordering(keys))[0]
+    problem = window._problem()
+    seen = replace(problem.sightings, free=0).linearised(values)
+    inertial = problem.inertial.linearize(values)
+    felt = inertial.keyVector()
+    keys = list(dict.fromkeys([*felt, *seen.keys]))
     begin = dict(zip(keys, np.cumsum([0, *(dimension(values, key) for key in keys)]).tolist(), strict=False))
+    H = np.zeros((sum(dimension(values, key) for key in keys),) * 2)
+    for some, G in ((felt, inertial.hessian(gtsam.Ordering(felt))[0]), (seen.keys, seen.G)):
+        columns = np.concatenate([np.arange(dimension(values, key)) + begin[key] for key in some])
+        H[np.ix_(columns, columns)] += G
     for known in window._known():
         columns = np.concatenate([np.arange(dimension(values, key)) + begin[key] for key in known.point])
         H[np.ix_(columns, columns)] += known.at(values).G

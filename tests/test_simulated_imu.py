@@ -219,7 +219,8 @@ def test_the_driver_reads_what_was_measured(precision: str, atol: float) -> None
     np.testing.assert_allclose([s.accel for s in samples], np.concatenate([b.accel for b in batches]), 0, atol)
     np.testing.assert_allclose([s.gyro for s in samples], np.concatenate([b.gyro for b in batches]), 0, atol)
     ticks = np.concatenate([b.ticks for b in batches])
-    np.testing.assert_array_equal([s.t_ns for s in samples], ticks * TICK_NS)
+    half_ns = 500_000_000 // RATE_HZ  # the middle of the time over which a sample is the mean
+    np.testing.assert_array_equal([s.t_ns for s in samples], ticks * TICK_NS - half_ns)
     assert (driver.counts.dropped_bytes, driver.counts.refused, driver.counts.missing) == (0, 0, 0)
     assert not driver.faults
 

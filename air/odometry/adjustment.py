@@ -1,14 +1,16 @@
-"""Gauss–Newton on what gtsam knows as factors together with what is known as quadratic functions; points go first."""
+"""Gauss–Newton on what frames see, what the IMU felt (gtsam's factors) and what is known as quadratic functions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
+from air.odometry.mounting import COLUMNS, MOUNTING
 from air.odometry.quadratic import NormalEquations, Quadratic, dimension
+from air.odometry.sightings import LinearSightings, Sightings
 from common.arrays import F64
 
 HALVINGS = 4
@@ -19,111 +21,104 @@ TOLERANCE, SMALL_TURN, SMALL_SHIFT = 1e-4, 2e-4, 0.005
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The values that were found, the covariance of one pose among them (6, 6), and how many iterations it took."""
+    """The values that were found, the covariances of the newest pose (6, 6) and of the mounting (10, 10), and how many
+    iterations it took."""
 
     values: gtsam.Values
-    covariance: F64
+    pose_covariance: F64
+    mounting_covariance: F64
     iterations: int
 
 
 @dataclass(frozen=True, eq=False)
-class Unknowns:
-    """How to solve: `points` are eliminated first, then the variables of a `chain` one by one, and the rest at once.
+class Problem:
+    """All that is known, and how to solve it.
 
-    `poses` tell when to stop; the covariance of the last one is wanted.
+    The variables of a `chain` are eliminated one by one, the rest at once. `poses`, the newest last, tell when to stop.
+    The columns `held` of the mounting stay.
     """
 
-    points: Sequence[int]
+    inertial: gtsam.NonlinearFactorGraph
+    sightings: Sightings
+    known: Sequence[Quadratic]
     chain: Sequence[int]
     poses: Sequence[int]
+    held: Sequence[int]
+
+    def error(self, values: gtsam.Values) -> float:
+        """Half the sum of squares."""
+        known = sum(one.error(values) for one in self.known)
+        return float(self.inertial.error(values)) + self.sightings.error(values) + known
 
 
-def adjust(
-    graph: gtsam.NonlinearFactorGraph,
-    known: Sequence[Quadratic],
-    values: gtsam.Values,
-    unknowns: Unknowns,
-    iterations: int,
-) -> Adjusted:
-    """The values that fit best, after some iterations at most.
-
-    Raises RuntimeError (of gtsam) where a point, and LinAlgError where anything else is undetermined.
-    """
-    error, covariance, done = _error(graph, known, values), np.eye(6), 0
+def adjust(problem: Problem, values: gtsam.Values, iterations: int) -> Adjusted:
+    """The values that fit best, after some iterations at most. Raises LinAlgError where anything is undetermined."""
+    error, covariance, done = problem.error(values), np.eye(6 + COLUMNS), 0
     while done < iterations:
         done += 1
-        change, covariance = _step(graph, known, values, unknowns)
-        new, new_error = _descent(graph, known, values, change, error)
+        change, covariance = _step(problem, values)
+        new, new_error = _descent(problem, values, change, error)
         if not new_error <= error:
             break
         improved, values, error = error - new_error, new, new_error
-        if improved < TOLERANCE * error or _is_small(change, unknowns.poses):
+        if improved < TOLERANCE * error or _is_small(change, problem.poses):
             break
-    return Adjusted(values, covariance, done)
+    return Adjusted(values, covariance[:6, :6], covariance[6:, 6:], done)
 
 
-def covariance_of(
-    key: int, graph: gtsam.NonlinearFactorGraph, known: Sequence[Quadratic], values: gtsam.Values, unknowns: Unknowns
-) -> F64:
-    """Covariance (D, D) of one variable that is no point. Raises as `adjust` does."""
-    rest = graph.linearize(values).eliminatePartialSequential(gtsam.Ordering(list(unknowns.points)))[1]
-    chain = [other for other in unknowns.chain if other != key]
-    return equations_of(rest, known, values).solve([key], chain)[1]
+def covariance_of(key: int, problem: Problem, values: gtsam.Values) -> F64:
+    """Covariance (D, D) of one variable that is no point. Raises LinAlgError where it is undetermined."""
+    equations = equations_of(problem.inertial, problem.sightings.linearised(values), problem.known, values)
+    return equations.solve([key], [other for other in problem.chain if other != key])[1]
 
 
-def equations_of(rest: gtsam.GaussianFactorGraph, known: Sequence[Quadratic], values: gtsam.Values) -> NormalEquations:
-    """The sum of gtsam's linear factors and of what else is known, at the same values."""
-    mine = rest.keyVector()
-    keys = dict.fromkeys(sorted(mine))
+def equations_of(
+    inertial: gtsam.NonlinearFactorGraph, seen: LinearSightings, known: Sequence[Quadratic], values: gtsam.Values
+) -> NormalEquations:
+    """The sum of all that is known, at the same values."""
+    linear = inertial.linearize(values)
+    felt = linear.keyVector()
+    keys = dict.fromkeys([*sorted(felt), *seen.keys])
     for one in known:
         keys |= dict.fromkeys(one.point)
     equations = NormalEquations({key: dimension(values, key) for key in keys})
-    if mine:
-        equations.add(mine, *rest.hessian(gtsam.Ordering(mine)))
+    equations.add(seen.keys, seen.G, seen.g)
+    if felt:
+        equations.add(felt, *linear.hessian(gtsam.Ordering(felt)))
     for one in known:
         here = one.at(values)
         equations.add(here.point, here.G, here.g)
     return equations
 
 
-def _step(
-    graph: gtsam.NonlinearFactorGraph, known: Sequence[Quadratic], values: gtsam.Values, unknowns: Unknowns
-) -> tuple[gtsam.VectorValues, F64]:
-    net, rest = graph.linearize(values).eliminatePartialSequential(gtsam.Ordering(list(unknowns.points)))
-    change, covariance = equations_of(rest, known, values).solve([unknowns.poses[-1]], unknowns.chain)
-    moved = gtsam.VectorValues()
-    for key, delta in change.items():
-        moved.insert(key, delta)
-    return net.optimize(moved), covariance
+def _step(problem: Problem, values: gtsam.Values) -> tuple[dict[int, F64], F64]:
+    seen = problem.sightings.linearised(values)
+    equations = equations_of(problem.inertial, seen, problem.known, values)
+    held = 6 + np.array(problem.held, np.int64)
+    change, covariance = equations.solve([problem.poses[-1], MOUNTING], problem.chain, held)
+    return change | seen.points(change), covariance
 
 
-def _is_small(change: gtsam.VectorValues, poses: Sequence[int]) -> bool:
-    moved = np.abs([change.at(key) for key in poses])
+def _is_small(change: Mapping[int, F64], poses: Sequence[int]) -> bool:
+    moved = np.abs([change[key] for key in poses])
     return bool(moved[:, :3].max() < SMALL_TURN and moved[:, 3:].max() < SMALL_SHIFT)
 
 
 def _descent(
-    graph: gtsam.NonlinearFactorGraph,
-    known: Sequence[Quadratic],
-    values: gtsam.Values,
-    change: gtsam.VectorValues,
-    error: float,
+    problem: Problem, values: gtsam.Values, change: Mapping[int, F64], error: float
 ) -> tuple[gtsam.Values, float]:
     """The values after a change and their error; after a part of it where all of it leads uphill.
 
     Along a scale that is hardly known the valley is long and curved.
     """
+    part = 1.0
     for _ in range(HALVINGS):
-        new = values.retract(change)
-        new_error = _error(graph, known, new)
+        step = gtsam.VectorValues()
+        for key, delta in change.items():
+            step.insert(key, part * delta)
+        new = values.retract(step)
+        new_error = problem.error(new)
         if new_error <= error:
             return new, new_error
-        half = gtsam.VectorValues()
-        for key in values.keys():  # noqa: SIM118
-            half.insert(key, 0.5 * change.at(key))
-        change = half
+        part /= 2
     return values, float("inf")
-
-
-def _error(graph: gtsam.NonlinearFactorGraph, known: Sequence[Quadratic], values: gtsam.Values) -> float:
-    return float(graph.error(values)) + sum(one.error(values) for one in known)

@@ -16,9 +16,11 @@ from air.odometry.initial import KnownSpeed, Refusal
 from air.odometry.initial_prior import Sigmas
 from air.odometry.initial_rest import moving
 from air.odometry.initialization import Initialization
+from air.odometry.mounting import Mounted, Mounting
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, Propagation
 from air.odometry.row_times import ideal_points
 from air.odometry.settings import OdometrySettings
+from air.odometry.sightings import Seen
 from air.odometry.tracker import TrackedFrame
 from air.odometry.window import Solution, Window
 from common.arrays import F64
@@ -70,6 +72,9 @@ class Estimator:
         it sits matters."""
         self._settings = settings or OdometrySettings()
         self._focal, self._T_body_cam = focal, T_body_cam or SE3.identity()
+        lever_arm = np.array(self._settings.gnss.p_body_antenna)
+        self.mounted = Mounted.beforehand(Mounting(self._T_body_cam, lever_arm), self._settings.mounting)
+        """What is known of the mounting; it outlives the window."""
         self.buffer = ImuBuffer(self._settings.imu)
         self.gnss = GnssCoupling(self._settings.gnss, self.buffer, flight, base)
         self._integrator = Preintegrator(self._settings.imu)
@@ -172,8 +177,8 @@ class Estimator:
             self.gnss.why_not = found
             return None
         assert self.gnss.start.datum is not None
-        window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
-        window.begin(found.state, found.covariance, {})
+        window = self._new_window()
+        window.begin(found.state, found.covariance, Seen.nothing())
         self.gnss.join(window, self.gnss.start.datum)
         self._window, self._monitor = window, Monitor(self._settings.degradation, visual=False, gnss=True)
         self._frame_ns = epoch.t_ns
@@ -181,8 +186,11 @@ class Estimator:
         self._propagate_from(found.state)
         return self._estimate(window, Solution(0.0, 0, 0), note="begins in motion, without a camera")
 
+    def _new_window(self) -> Window:
+        return Window(self._focal, self.mounted, self.buffer, self._settings.window, self._settings.imu)
+
     def _lose_window(self) -> None:
-        """What follows begins from nothing, but for what satellites broadcast."""
+        """What follows begins from nothing, but for what satellites broadcast and what was learnt of the mounting."""
         self._window, self._initialization = None, self._new_initialization()
         self.gnss.leave()
 
@@ -205,7 +213,7 @@ class Estimator:
         initial = self._initialization.feed(frame)
         if isinstance(initial, Refusal):
             return initial
-        window = Window(self._focal, self._T_body_cam, self.buffer, self._settings.window, self._settings.imu)
+        window = self._new_window()
         first = initial.states[0]
         covariance = initial.sigmas.covariance(first.T_world_body.R)
         window.begin(first, covariance, self._points_at(initial.frames[0], first, {}, initial.depth))
@@ -266,20 +274,19 @@ class Estimator:
         still: bool = False,
         note: str = "",
     ) -> Estimate:
-        newest = window.frames[-1]
+        newest, self.mounted = window.frames[-1], window.mounted
         # An aircraft that stands needs no points to know where it is.
-        points = self._settings.degradation.enough_points if still else len(newest.factors)
+        seen = len(window.points.intersection(newest.seen.ids.tolist()))
+        points = self._settings.degradation.enough_points if still else seen
         mode = self._monitor.update(newest.t_ns, points, self.gnss.satellites(newest.t_ns))
         return Estimate(window.state(), window.pose_covariance, mode, self.revision, solution, keyframe, note)
 
-    def _points_at(
-        self, frame: TrackedFrame, state: InertialState, depths: dict[int, float], usual: float
-    ) -> dict[int, F64]:
+    def _points_at(self, frame: TrackedFrame, state: InertialState, depths: dict[int, float], usual: float) -> Seen:
         """What a frame sees, moved from the times of its rows to its own."""
         pieces = self.buffer.between(frame.t_ns - HALF_GYRO_NS, frame.t_ns + HALF_GYRO_NS)
-        omega = pieces.rate - state.gyro_bias
-        v_body = state.T_world_body.R.T @ state.v_world + np.cross(omega, self._T_body_cam.t)
-        R = self._T_body_cam.R.T
+        omega, T_body_cam = pieces.rate - state.gyro_bias, self.mounted.now.T_body_cam
+        v_body = state.T_world_body.R.T @ state.v_world + np.cross(omega, T_body_cam.t)
+        R = T_body_cam.R.T
         return ideal_points(frame, self._focal, R @ omega, R @ v_body, depths, usual)
 
     def _remember(self, frame: TrackedFrame) -> None:

@@ -20,17 +20,18 @@ from air.gnss.orbit import EARTH_RATE, geometric_range
 from air.gnss.signals import LIGHT
 from air.odometry.gnss_biases import REFERENCE_SYSTEMS, BiasNode, Kind
 from air.odometry.gnss_preprocessing import CleanEpoch
+from air.odometry.mounting import ANTENNA, COLUMNS
 from common.arrays import F64, I64
 from common.se3 import SE3, skew
 
-POSE, VELOCITY, BIAS = slice(0, 6), slice(6, 9), slice(9, 15)
-STATES = 15
-"""Columns of a keyframe: gtsam's tangent of its pose (rotation, translation, both in body), velocity, IMU biases."""
+STATES = 25
+"""Columns of a keyframe: gtsam's tangent of its pose (rotation, translation, both in body), velocity, IMU biases; and
+of the corrections of the mounting."""
 
 
 @dataclass(frozen=True, eq=False)
 class AntennaMotion:
-    """The antenna `p_world` (3,) m and `v_world` (3,) m/s, and how they change with the keyframe: (3, 15) each."""
+    """The antenna `p_world` (3,) m and `v_world` (3,) m/s, and how they change with keyframe and mounting: (3, 25)."""
 
     p_world: F64
     v_world: F64
@@ -40,7 +41,7 @@ class AntennaMotion:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Rows of one or more epochs, as ½ (f − 2 gᵀδ + δᵀ G δ) of a keyframe's 15 columns and a node's D columns.
+    """Rows of one or more epochs, as ½ (f − 2 gᵀδ + δᵀ G δ) of 25 columns of keyframe and mounting and D of a node.
 
     `rows` were used.
     """
@@ -75,8 +76,18 @@ def antenna_motion(
     v_by_state = R @ (by[6:] - skew(swing) @ by[:3])
     v_by_state[:, 12:15] += R @ skew(p_body_antenna)
     return AntennaMotion(
-        nav.pose().translation() + R @ p_body_antenna, nav.velocity() + R @ swing, p_by_state, v_by_state
+        nav.pose().translation() + R @ p_body_antenna,
+        nav.velocity() + R @ swing,
+        np.hstack([p_by_state, _of_antenna(R)]),
+        np.hstack([v_by_state, _of_antenna(R @ skew(omega))]),
     )
+
+
+def _of_antenna(by_antenna: F64) -> F64:
+    """Derivatives (3, 10) by the mounting of what changes with the lever arm only."""
+    out = np.zeros((3, COLUMNS))
+    out[:, ANTENNA] = by_antenna
+    return out
 
 
 def linearise(

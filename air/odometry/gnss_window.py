@@ -21,6 +21,7 @@ from air.odometry.gnss_factors import antenna_motion, linearise, total
 from air.odometry.gnss_fixing import fix
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssSettings
+from air.odometry.mounting import ANTENNA, MOUNTING
 from air.odometry.preintegration import ImuBuffer, ImuPieces
 from air.odometry.quadratic import Quadratic, variable
 from air.odometry.window import Frame, Window
@@ -190,13 +191,14 @@ class GnssWindow:
     def _linearised(self, values: gtsam.Values, stretch: _Stretch, taken: Sequence[_Taken]) -> Quadratic:
         k, node = stretch.k, stretch.node
         pose, velocity, bias = values.atPose3(X(k)), values.atVector(V(k)), values.atConstantBias(B(k))
-        u, robust = values.atVector(node.key), self._settings.noise.robust if stretch.weighted else np.inf
-        parts = []
+        u, m = values.atVector(node.key), values.atVector(MOUNTING)
+        robust = self._settings.noise.robust if stretch.weighted else np.inf
+        lever, parts = self._lever + m[ANTENNA], []
         for one in taken:
-            motion = antenna_motion(pose, velocity, bias, one.measured, self._lever, one.omega)
+            motion = antenna_motion(pose, velocity, bias, one.measured, lever, one.omega)
             parts.append(linearise(one.epoch, motion, node, u, self._T_ecef_world, robust, one.line_carrier))
         whole = total(parts)
-        point = {X(k): pose, V(k): velocity, B(k): bias.vector(), node.key: u}
+        point = {X(k): pose, V(k): velocity, B(k): bias.vector(), MOUNTING: m, node.key: u}
         return Quadratic(point, whole.G, whole.g, whole.f)
 
     def _is_stale(self, values: gtsam.Values, stretch: _Stretch) -> bool:

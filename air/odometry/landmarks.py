@@ -17,16 +17,24 @@ from common.se3 import SE3
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one frame sees: its pose, and ideal image points (2,) px by point."""
+    """What one frame sees: its pose, and ideal image points (N, 2) px of the points `ids` (N,)."""
 
     T_world_cam: SE3
-    xy: Mapping[int, F64]
+    ids: I64
+    xy: F64
 
 
-def locate(
-    views: Sequence[View], ids: Sequence[int], focal: float, min_angle: float, limit_px: float
-) -> dict[int, F64]:
-    """Points (3,) m in world, by id, that rays from at least two views determine.
+@dataclass(frozen=True, eq=False)
+class Misses:
+    """M observations: index of the view, id of the point, distance px from where it should appear (∞ behind)."""
+
+    view: I64
+    id: I64
+    error: F64
+
+
+def locate(views: Sequence[View], ids: I64, focal: float, min_angle: float, limit_px: float) -> dict[int, F64]:
+    """Points (3,) m in world, by id, that rays from at least two views determine. `ids` rise.
 
     Their rays open by `min_angle` rad at least, they lie before all cameras, and appear within `limit_px` of where they
     were seen.
@@ -36,23 +44,19 @@ def locate(
         return {}
     rays = np.column_stack([seen.xy / focal, np.ones(len(seen.xy))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    R, t = np.array([v.T_world_cam.R for v in views])[seen.view], np.array([v.T_world_cam.t for v in views])[seen.view]
+    R, t = _poses(views, seen.view)
     points, angles = triangulate(np.einsum("nij,nj->ni", R, rays), t, seen.row, len(ids))
     worst = np.zeros(len(ids))
     np.maximum.at(worst, seen.row, _errors(R, t, points[seen.row], seen.xy, focal))
     good = (angles >= min_angle) & (worst <= limit_px) & (np.bincount(seen.row, minlength=len(ids)) >= 2)
-    return {ids[i]: points[i] for i in np.flatnonzero(good).tolist()}
+    return {int(ids[i]): points[i] for i in np.flatnonzero(good)}
 
 
-def outliers(views: Sequence[View], points: Mapping[int, F64], focal: float, limit_px: float) -> list[tuple[int, int]]:
-    """Observations, as index of the view and id, further than `limit_px` from where their point should appear."""
-    ids = list(points)
+def misses(views: Sequence[View], ids: I64, points: F64, focal: float) -> Misses:
+    """How far points (N, 3) m in world, whose `ids` (N,) rise, appear from where they were seen."""
     seen = _gather(views, ids)
-    if not len(seen.row):
-        return []
-    R, t = np.array([v.T_world_cam.R for v in views])[seen.view], np.array([v.T_world_cam.t for v in views])[seen.view]
-    error = _errors(R, t, np.array(list(points.values()))[seen.row], seen.xy, focal)
-    return [(int(seen.view[i]), ids[seen.row[i]]) for i in np.flatnonzero(~(error <= limit_px)).tolist()]
+    R, t = _poses(views, seen.view)
+    return Misses(seen.view, ids[seen.row], _errors(R, t, points[seen.row], seen.xy, focal))
 
 
 def depths(points: Mapping[int, F64], T_world_cam: SE3) -> dict[int, float]:
@@ -61,18 +65,6 @@ def depths(points: Mapping[int, F64], T_world_cam: SE3) -> dict[int, float]:
         return {}
     z = T_world_cam.inverse().apply(np.array(list(points.values())))[:, 2]
     return {i: float(d) for i, d in zip(points, z, strict=True) if d > 0}
-
-
-def rms_px(views: Sequence[View], points: Mapping[int, F64], focal: float) -> float:
-    """Root mean square distance px between where points should appear and were seen; 0 without any."""
-    square, count = 0.0, 0
-    for view in views:
-        ids = [i for i in view.xy if i in points]
-        if ids:
-            p = view.T_world_cam.inverse().apply(np.array([points[i] for i in ids]))
-            miss = focal * p[:, :2] / p[:, 2:] - np.array([view.xy[i] for i in ids])
-            square, count = square + float(np.sum(miss**2)), count + len(ids)
-    return float(np.sqrt(square / count)) if count else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +76,21 @@ class _Seen:
     xy: F64
 
 
-def _gather(views: Sequence[View], ids: Sequence[int]) -> _Seen:
-    found = [(v, row, view.xy[i]) for row, i in enumerate(ids) for v, view in enumerate(views) if i in view.xy]
-    if not found:
-        return _Seen(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-    view, row, xy = zip(*found, strict=True)
-    return _Seen(np.array(view), np.array(row), np.array(xy))
+def _gather(views: Sequence[View], ids: I64) -> _Seen:
+    view, row, xy = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    for v, one in enumerate(views):
+        rows = np.searchsorted(ids, one.ids)
+        found = np.flatnonzero(np.isin(one.ids, ids))
+        view.append(np.full(len(found), v))
+        row.append(rows[found])
+        xy.append(one.xy[found])
+    return _Seen(np.concatenate(view), np.concatenate(row), np.concatenate(xy))
+
+
+def _poses(views: Sequence[View], view: I64) -> tuple[F64, F64]:
+    """`R_world_cam` (M, 3, 3) and positions (M, 3) m of the views of M observations."""
+    R = np.array([v.T_world_cam.R for v in views]).reshape(-1, 3, 3)
+    return R[view], np.array([v.T_world_cam.t for v in views]).reshape(-1, 3)[view]
 
 
 def _errors(R: F64, t: F64, p_world: F64, xy: F64, focal: float) -> F64:

@@ -50,6 +50,12 @@ class Quadratic:
         moved = np.concatenate([_moved(then, variable(values, key)) for key, then in self.point.items()])
         return float(self.f - 2 * self.g @ moved + moved @ self.G @ moved) / 2
 
+    def beside(self, other: Quadratic) -> Quadratic:
+        """This and another one of other variables together."""
+        a, b = len(self.g), len(other.g)
+        G = np.block([[self.G, np.zeros((a, b))], [np.zeros((b, a)), other.G]])
+        return Quadratic({**self.point, **other.point}, G, np.concatenate([self.g, other.g]), self.f + other.f)
+
     def carried(self, T_new_world: SE3, covariance: F64) -> Quadratic:
         """The same in another world that is turned about the vertical and shifted against this one.
 
@@ -69,6 +75,17 @@ class Quadratic:
         GJ = G @ J
         loose = np.linalg.inv(np.linalg.inv(covariance) + J.T @ GJ)
         return Quadratic(point, G - GJ @ loose @ GJ.T, g - GJ @ loose @ (J.T @ g), self.f)
+
+
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """What variables that left are when those that stayed are known: their change is `shift` (A,) − `by` (A, B) times
+    the change of these, both from where they were when they parted, `gone` and `left`."""
+
+    gone: Mapping[int, Variable]
+    left: Mapping[int, Variable]
+    by: F64
+    shift: F64
 
 
 class NormalEquations:
@@ -95,10 +112,14 @@ class NormalEquations:
         """Where some of the variables are."""
         return np.concatenate([self._columns[key] for key in keys])
 
-    def solve(self, covariance_of: Sequence[int], first: Sequence[int] = ()) -> tuple[dict[int, F64], F64]:
+    def solve(
+        self, covariance_of: Sequence[int], first: Sequence[int] = (), held: I64 | None = None
+    ) -> tuple[dict[int, F64], F64]:
         """The change of each variable, and the covariance of some together. Raises LinAlgError where undetermined.
 
         What is eliminated `first`, key by key, costs little where it is linked to few others. It has no covariance.
+        `held` are indices into the columns of `covariance_of` that stay where they are; covariances are those of all
+        being free.
         """
         G, g, left, ways = self.G.copy(), self.g.copy(), np.ones(len(self.g), bool), []
         for key in first:
@@ -114,20 +135,25 @@ class NormalEquations:
         wanted = np.zeros((len(g), len(columns)))
         wanted[columns, np.arange(len(columns))] = 1.0
         found, change = _solve(G[np.ix_(rest, rest)], np.column_stack([g, wanted])[rest]), np.zeros(len(g))
-        change[rest] = found[:, 0]
+        change[rest], with_all = found[:, 0], found[:, 1:]
+        covariance = with_all[np.searchsorted(rest, columns)]
+        if held is not None and len(held):
+            gain = np.linalg.solve(covariance[np.ix_(held, held)], change[columns[held]])
+            change[rest] -= with_all[:, held] @ gain
         for own, others, way in reversed(ways):
             change[own] = way[:, -1] - way[:, :-1] @ change[others]
-        covariance = found[np.searchsorted(rest, columns), 1:]
         return {key: change[c] for key, c in self._columns.items()}, covariance
 
-    def without(self, leaving: Sequence[int], values: gtsam.Values) -> Quadratic:
-        """What the sum knows of the others after some left. Raises LinAlgError where these are undetermined."""
+    def without(self, leaving: Sequence[int], values: gtsam.Values) -> tuple[Quadratic, Conditional]:
+        """What the sum knows of the others after some left, and of those given the others. Raises LinAlgError where
+        what leaves is undetermined."""
         staying = [key for key in self._columns if key not in set(leaving)]
         a, b = self.columns(leaving), self.columns(staying)
         way = _solve(self.G[np.ix_(a, a)], np.column_stack([self.G[np.ix_(a, b)], self.g[a]]))
         G = self.G[np.ix_(b, b)] - self.G[np.ix_(b, a)] @ way[:, :-1]
         g = self.g[b] - self.G[np.ix_(b, a)] @ way[:, -1]
-        return Quadratic({key: variable(values, key) for key in staying}, (G + G.T) / 2, g)
+        gone, left = ({key: variable(values, key) for key in keys} for keys in (leaving, staying))
+        return Quadratic(left, (G + G.T) / 2, g), Conditional(gone, left, way[:, :-1], way[:, -1])
 
 
 def variable(values: gtsam.Values, key: int) -> Variable:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from air.odometry.gnss_settings import GnssSettings
+from air.odometry.mounting import MountingSettings
 from common.config import Range
 
 
@@ -125,4 +126,5 @@ class OdometrySettings:
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     gnss: GnssSettings = field(default_factory=GnssSettings)
+    mounting: MountingSettings = field(default_factory=MountingSettings)
     degradation: DegradationSettings = field(default_factory=DegradationSettings)

@@ -1,49 +1,51 @@
-"""The sliding window: keyframes, points and IMU in one factor graph that is solved at each frame.
+"""The sliding window: keyframes, points and IMU in one adjustment that is solved at each frame.
 
-Keys: `X(k)` pose of the body in world, `V(k)` its velocity, `B(k)` the biases of the IMU at frame k, `L(i)` a point.
-Source: S. Leutenegger et al., Keyframe-based visual–inertial odometry using nonlinear optimization (2015); the two ways
-to marginalize are those of T. Qin et al., VINS-Mono (2018), section VI-C.
+Keys: `X(k)` pose of the body in world, `V(k)` its velocity, `B(k)` the biases of the IMU at frame k, `L(i)` a point,
+`MOUNTING` the corrections of where camera and antenna sit. Source: S. Leutenegger et al., Keyframe-based
+visual–inertial odometry using nonlinear optimization (2015); the two ways to marginalize are those of T. Qin et al.,
+VINS-Mono (2018), section VI-C.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
-from air.odometry.adjustment import Unknowns, adjust, covariance_of, equations_of
+from air.odometry.adjustment import Problem, adjust, covariance_of, equations_of
+from air.odometry.companion import Companion, History
 from air.odometry.initial_prior import initial_prior
-from air.odometry.landmarks import View, depths, locate, outliers, rms_px
+from air.odometry.landmarks import View, depths, locate, misses
+from air.odometry.mounting import MOUNTING, Mounted
+from air.odometry.parallax import parallax
 from air.odometry.preintegration import ImuBuffer, InertialState, Preintegrator, from_pose3, to_pose3
 from air.odometry.quadratic import Quadratic, by_world, carried, variable
 from air.odometry.settings import ImuSettings, WindowSettings
-from common.arrays import F64
+from air.odometry.sightings import Lens, Seen, Sightings
+from common.arrays import F64, I64
 from common.se3 import SE3
 
 noise = gtsam.noiseModel
-HUBER = 1.345
 WEAK = 100.0
-"""Sigma of the prior of a point, in distances of the point."""
-TRIALS, SETTLING = 5, 6
-"""How many undetermined points are removed before a solution is given up."""
+"""Sigma of the prior of a point, in distances of the point: many such priors together must not hold the scale."""
+SETTLING = 6
 STILL_SPEED, STILL_TURN, STILL_SHIFT = 0.05, 0.002, 0.005
 """How far the aircraft moves while it stands, m/s, rad and m."""
 
 
 @dataclass(eq=False)
 class Frame:
-    """A frame in the window. `xy` are ideal image points (2,) px by id, moved to where they were at `t_ns`."""
+    """A frame in the window."""
 
     k: int
     t_ns: int
-    xy: dict[int, F64]
+    seen: Seen
     motion: gtsam.PreintegratedCombinedMeasurements | None = None
     still: bool = False
-    factors: dict[int, gtsam.NonlinearFactor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -56,41 +58,26 @@ class Solution:
     failed: bool = False
 
 
-class Companion(Protocol):
-    """Somebody who knows more about the frames in the window, such as GNSS.
-
-    It keeps values of its own keys in `window.values`.
-    """
-
-    def terms(self, window: Window) -> list[Quadratic]:
-        """What it knows about the frames that the window holds now."""
-        ...
-
-    def leaving(self, window: Window, k: int) -> tuple[list[int], list[Quadratic]]:
-        """Own keys that leave with frame k, and all that it knows about them and that frame."""
-        ...
-
-
 class Window:
     """About ten keyframes and the newest frame. Add a frame, solve, slide."""
 
     def __init__(
-        self, focal: float, T_body_cam: SE3, imu: ImuBuffer, settings: WindowSettings, imu_settings: ImuSettings
+        self, focal: float, mounted: Mounted, imu: ImuBuffer, settings: WindowSettings, imu_settings: ImuSettings
     ) -> None:
-        self._focal, self._T_body_cam, self._imu = focal, T_body_cam, imu
+        self._focal, self._imu = focal, imu
+        self.mounted = mounted
+        """What is known of the mounting."""
+        self._lens = Lens(focal, settings.pixel_sigma, mounted.nominal)
         self._settings, self._imu_settings = settings, imu_settings
         self.preintegrator = Preintegrator(imu_settings)
         self.values = gtsam.Values()
         self.frames: list[Frame] = []
         self.points: set[int] = set()
         self.companion: Companion | None = None
+        self.history: History | None = None
         self._anchored: set[int] = set()
         self._prior: Quadratic | None = None
         self._covariance = np.eye(6)
-        self._calibration = gtsam.Cal3_S2(focal, focal, 0.0, 0.0, 0.0)
-        self._pose_of_camera = to_pose3(T_body_cam)
-        pixel = noise.Isotropic.Sigma(2, settings.pixel_sigma)
-        self._pixel = noise.Robust.Create(noise.mEstimator.Huber.Create(HUBER), pixel)
 
     # What is known
 
@@ -117,32 +104,37 @@ class Window:
 
     def depths(self, state: InertialState) -> dict[int, float]:
         """Distance m along the camera's axis of the points, by id, seen from a state; those before the camera."""
-        return depths(self.positions(), state.T_world_body @ self._T_body_cam)
+        return depths(self.positions(), state.T_world_body @ self.mounted.now.T_body_cam)
 
     # Frames
 
-    def begin(self, state: InertialState, covariance: F64, xy: dict[int, F64]) -> None:
-        """Start anew from a first frame whose state is known within a covariance (15, 15), as `Sigmas` have it."""
+    def begin(self, state: InertialState, covariance: F64, seen: Seen) -> None:
+        """Start anew from a first frame whose state is known within a covariance (15, 15), as `Sigmas` have it.
+
+        What has been learnt of the mounting stays.
+        """
         k = self.frames[-1].k + 1 if self.frames else 0
         self.values, self.frames, self.points, self._anchored = gtsam.Values(), [], set(), set()
         self._insert(k, state)
-        self.frames.append(Frame(k, state.t_ns, xy))
-        self._prior, self._covariance = initial_prior(k, state, covariance, self._imu_settings), covariance[:6, :6]
+        self.values.insert(MOUNTING, self.mounted.u)
+        self.frames.append(Frame(k, state.t_ns, seen))
+        self._prior = initial_prior(k, state, covariance, self._imu_settings).beside(self.mounted.prior())
+        self._covariance = covariance[:6, :6]
+        if self.history is not None:
+            self.history.begun(k)
 
     def predict(self, t_ns: int, index: int = -1) -> InertialState:
         """Where the state of a frame, by default of the newest, leads to by the IMU."""
         state = self.state(index)
         return self.preintegrator.predict(state, self._imu.between(state.t_ns, t_ns))
 
-    def add(self, t_ns: int, xy: dict[int, F64], state: InertialState | None = None, still: bool = False) -> None:
+    def add(self, t_ns: int, seen: Seen, state: InertialState | None = None, still: bool = False) -> None:
         """Add the newest frame, at the state that the IMU predicts unless one is given, and locate new points."""
         state = state or self.predict(t_ns)
         last = self.frames[-1]
-        frame = Frame(last.k + 1, t_ns, xy, self._motion(last, t_ns), still)
+        frame = Frame(last.k + 1, t_ns, seen, self._motion(last, t_ns), still)
         self._insert(frame.k, state)
         self.frames.append(frame)
-        for i in self.points & xy.keys():
-            self._observe(frame, i)
         self._locate()
 
     def _insert(self, k: int, state: InertialState) -> None:
@@ -157,50 +149,49 @@ class Window:
     # Points
 
     def _views(self) -> list[View]:
-        return [View(from_pose3(self.values.atPose3(X(f.k))) @ self._T_body_cam, f.xy) for f in self.frames]
+        now = self.mounted.now
+        poses = [from_pose3(self.values.atPose3(X(frame.k))) @ now.T_body_cam for frame in self.frames]
+        seen = [frame.seen for frame in self.frames]
+        return [View(T, s.ids, s.late(now.delay_s)) for T, s in zip(poses, seen, strict=True)]
+
+    def _ids(self) -> I64:
+        return np.array(sorted(self.points), np.int64)
 
     def _locate(self) -> None:
-        s, candidates = self._settings, sorted(self.frames[-1].xy.keys() - self.points)
+        s, candidates = self._settings, np.setdiff1d(self.frames[-1].seen.ids, self._ids())
         limit = s.max_residual * s.pixel_sigma
         found = locate(self._views(), candidates, self._focal, np.radians(s.min_angle_deg), limit)
         for i, p_world in found.items():
             self.values.insert(L(i), p_world)
             self.points.add(i)
-            for frame in self.frames:
-                if i in frame.xy:
-                    self._observe(frame, i)
 
-    def _observe(self, frame: Frame, i: int) -> None:
-        frame.factors[i] = gtsam.GenericProjectionFactorCal3_S2(
-            frame.xy[i], self._pixel, X(frame.k), L(i), self._calibration, False, False, self._pose_of_camera
-        )
-
-    def _forget(self, i: int) -> None:
-        """Remove a point with all that was seen of it."""
+    def _forget(self, ids: Iterable[int]) -> None:
+        """Remove points with all that was seen of them."""
+        gone = np.array(sorted(ids), np.int64)
         for frame in self.frames:
-            frame.xy.pop(i, None)
-            frame.factors.pop(i, None)
-        self._drop(i)
+            frame.seen = frame.seen.without(gone)
+        for i in gone.tolist():
+            self._drop(i)
 
     def _drop(self, i: int) -> None:
         self.points.discard(i)
         if i not in self._anchored:
             self.values.erase(L(i))
 
+    def _drop_lonely(self) -> None:
+        """Points that a single frame sees have no place, until another one sees them too."""
+        free = np.array(sorted(self.points - self._anchored), np.int64)
+        times = sum((np.isin(free, frame.seen.ids).astype(int) for frame in self.frames), np.zeros(len(free), int))
+        for i in free[times < 2].tolist():
+            self._drop(i)
+
     # Solution
 
     def solve(self) -> Solution:
         """Adjust everything in the window; what turns out to be an outlier leaves."""
-        for _ in range(TRIALS):
-            try:
-                iterations = self._adjust()
-                break
-            except RuntimeError as error:  # gtsam names an undetermined variable
-                if not self._remove_named(str(error)):
-                    return Solution(np.inf, len(self.points), 0, failed=True)
-            except np.linalg.LinAlgError:
-                return Solution(np.inf, len(self.points), 0, failed=True)
-        else:
+        try:
+            iterations = self._adjust()
+        except np.linalg.LinAlgError:
             return Solution(np.inf, len(self.points), 0, failed=True)
         self._reintegrate()
         rms = self._prune()
@@ -226,63 +217,67 @@ class Window:
         J = by_world(newest, variable(self.values, newest), T_new_world.t)
         self._covariance = self._covariance + J @ covariance @ J.T
 
-    def _remove_named(self, error: str) -> bool:
-        named = re.search(r"Symbol: l(\d+)", error)
-        if named is None or int(named[1]) not in self.points or int(named[1]) in self._anchored:
-            return False
-        self._forget(int(named[1]))
-        return True
-
     def _adjust(self) -> int:
         """Iterations that it took."""
-        known = self._known()
-        adjusted = adjust(self._graph(), known, self.values, self._unknowns(known), self._settings.iterations)
-        self.values, self._covariance = adjusted.values, adjusted.covariance
+        adjusted = adjust(self._problem(), self.values, self._settings.iterations)
+        self.values, self._covariance = adjusted.values, adjusted.pose_covariance
+        self.mounted = self.mounted.told(self.values.atVector(MOUNTING), adjusted.mounting_covariance)
         return adjusted.iterations
 
     def covariance_of(self, key: int) -> F64:
-        """Covariance (D, D) of a companion's variable. Raises RuntimeError or LinAlgError where it is undetermined."""
-        known = self._known()
-        return covariance_of(key, self._graph(), known, self.values, self._unknowns(known))
+        """Covariance (D, D) of a companion's variable. Raises LinAlgError where it is undetermined."""
+        return covariance_of(key, self._problem(), self.values)
 
-    def _unknowns(self, known: list[Quadratic]) -> Unknowns:
+    def _problem(self) -> Problem:
+        known = self._known()
         frames = [key for f in self.frames for key in (V(f.k), B(f.k), X(f.k))]
         anchored = [L(i) for i in self._anchored]
-        others = {key for one in known for key in one.point}.difference(frames, anchored)
-        return Unknowns(
-            points=[L(i) for i in sorted(self.points - self._anchored)],
+        others = {key for one in known for key in one.point}.difference(frames, anchored, [MOUNTING])
+        free = self.points - self._anchored
+        return Problem(
+            inertial=self._inertial(self.frames),
+            sightings=self._sightings(self.frames, free, self.points - free),
+            known=known,
             chain=sorted(others),
             poses=[X(f.k) for f in self.frames],
+            held=self.mounted.held,
         )
 
     def _known(self) -> list[Quadratic]:
-        """What is known beside the factors that gtsam knows."""
+        """What is known as quadratic functions."""
         assert self._prior is not None
         return [self._prior, *(self.companion.terms(self) if self.companion is not None else [])]
 
-    def _graph(self) -> gtsam.NonlinearFactorGraph:
+    def _inertial(self, frames: list[Frame]) -> gtsam.NonlinearFactorGraph:
+        """What the IMU felt from frame to frame."""
         graph = gtsam.NonlinearFactorGraph()
-        for last, frame in zip(self.frames, self.frames[1:], strict=False):
-            self._add_motion(graph, last, frame)
-        for frame in self.frames:
-            for factor in frame.factors.values():
-                graph.add(factor)
-        for i in sorted(self.points):
-            graph.add(self._weak(i))
+        for a, b in pairwise(frames):
+            graph.add(gtsam.CombinedImuFactor(X(a.k), V(a.k), X(b.k), V(b.k), B(a.k), B(b.k), b.motion))
+            if b.still:
+                graph.add(gtsam.PriorFactorVector(V(b.k), np.zeros(3), noise.Isotropic.Sigma(3, STILL_SPEED)))
+                stay = noise.Diagonal.Sigmas(np.repeat([STILL_TURN, STILL_SHIFT], 3))
+                graph.add(gtsam.BetweenFactorPose3(X(a.k), X(b.k), gtsam.Pose3(), stay))
         return graph
 
-    def _add_motion(self, graph: gtsam.NonlinearFactorGraph, a: Frame, b: Frame) -> None:
-        graph.add(gtsam.CombinedImuFactor(X(a.k), V(a.k), X(b.k), V(b.k), B(a.k), B(b.k), b.motion))
-        if b.still:
-            graph.add(gtsam.PriorFactorVector(V(b.k), np.zeros(3), noise.Isotropic.Sigma(3, STILL_SPEED)))
-            stay = noise.Diagonal.Sigmas(np.repeat([STILL_TURN, STILL_SHIFT], 3))
-            graph.add(gtsam.BetweenFactorPose3(X(a.k), X(b.k), gtsam.Pose3(), stay))
-
-    def _weak(self, i: int) -> gtsam.NonlinearFactor:
-        """So little that it only keeps the system regular: many such priors together must not hold the scale."""
-        p_world = self.values.atPoint3(L(i))
-        distance = float(np.linalg.norm(p_world - self.values.atPose3(X(self.frames[-1].k)).translation()))
-        return gtsam.PriorFactorPoint3(L(i), p_world, noise.Isotropic.Sigma(3, WEAK * max(distance, 1e-3)))
+    def _sightings(self, frames: list[Frame], free: set[int], kept: set[int], weak: float = 1.0) -> Sightings:
+        """What frames see of some points: the `free` are eliminated, the `kept` held by `weak` times the usual."""
+        order = np.array([*sorted(free), *sorted(kept)], np.int64)
+        rank = np.argsort(order)
+        seen = [frame.seen.among(order) for frame in frames]
+        ids = np.concatenate([s.ids for s in seen])
+        p_world = np.array([self.values.atPoint3(L(i)) for i in order.tolist()]).reshape(-1, 3)
+        away = np.linalg.norm(p_world - self.values.atPose3(X(self.frames[-1].k)).translation(), axis=1)
+        return Sightings(
+            lens=self._lens,
+            frames=[X(frame.k) for frame in frames],
+            points=[L(i) for i in order.tolist()],
+            free=len(free),
+            frame=np.repeat(np.arange(len(frames)), [len(s.ids) for s in seen]),
+            point=rank[np.searchsorted(order[rank], ids)],
+            xy=np.concatenate([s.xy for s in seen]),
+            rate=np.concatenate([s.rate for s in seen]),
+            weak=np.repeat([1.0, weak], [len(free), len(kept)]) * (WEAK * np.maximum(away, 1e-3)) ** -2.0,
+        )
 
     def _reintegrate(self) -> None:
         """Integrate the IMU again where the bias moved too far."""
@@ -292,20 +287,14 @@ class Window:
 
     def _prune(self) -> float:
         """Drop outliers; the root mean square of the other residuals, px."""
-        s, views, points = self._settings, self._views(), self.positions()
-        limit = s.max_residual * s.pixel_sigma
-        for v, i in outliers(views, points, self._focal, limit):
-            self.frames[v].xy.pop(i)
-            self.frames[v].factors.pop(i, None)
+        ids = self._ids()
+        p_world = np.array([self.values.atPoint3(L(i)) for i in ids.tolist()]).reshape(-1, 3)
+        missed = misses(self._views(), ids, p_world, self._focal)
+        far = ~(missed.error <= self._settings.max_residual * self._settings.pixel_sigma)
+        for v in set(missed.view[far].tolist()):
+            self.frames[v].seen = self.frames[v].seen.without(missed.id[far & (missed.view == v)])
         self._drop_lonely()
-        return rms_px(views, {i: points[i] for i in self.points & points.keys()}, self._focal)
-
-    def _drop_lonely(self) -> None:
-        for i in sorted(self.points - self._anchored):
-            if sum(i in frame.factors for frame in self.frames) < 2:
-                self._drop(i)
-                for frame in self.frames:
-                    frame.factors.pop(i, None)
+        return float(np.sqrt(np.mean(missed.error[~far] ** 2))) if (~far).any() else 0.0
 
     # Sliding
 
@@ -326,21 +315,18 @@ class Window:
 
     def is_keyframe(self, last: Frame, frame: Frame) -> bool:
         """The parallax test: whether points moved far enough beyond what turning does, or too few are left."""
-        common = sorted(last.xy.keys() & frame.xy.keys())
-        if (frame.t_ns - last.t_ns) * 1e-9 > self._settings.longest_s:
+        span_s = (frame.t_ns - last.t_ns) * 1e-9
+        if span_s > self._settings.longest_s:
             return True
-        if not last.xy and not frame.xy:
-            return (frame.t_ns - last.t_ns) * 1e-9 > self._settings.blind_s
-        if len(common) < self._settings.overlap * max(len(frame.xy), 1):
+        if not len(last.seen.ids) and not len(frame.seen.ids):
+            return span_s > self._settings.blind_s
+        a, b = last.seen.among(frame.seen.ids), frame.seen.among(last.seen.ids)
+        if len(a.ids) < self._settings.overlap * max(len(frame.seen.ids), 1):
             return True
-        a, b = (np.array([f.xy[i] for i in common]) for f in (last, frame))
-        R_a_b = (self._R_world_cam(last).T @ self._R_world_cam(frame)).T
-        turned = np.column_stack([a / self._focal, np.ones(len(a))]) @ R_a_b.T
-        shift = np.linalg.norm(self._focal * turned[:, :2] / turned[:, 2:] - b, axis=1)
-        return bool(np.median(shift) > np.radians(self._settings.parallax_deg) * self._focal)
-
-    def _R_world_cam(self, frame: Frame) -> F64:
-        return np.asarray(self.values.atPose3(X(frame.k)).rotation().matrix() @ self._T_body_cam.R)
+        R_world_last, R_world_frame = (self.values.atPose3(X(f.k)).rotation().matrix() for f in (last, frame))
+        R_body_cam = self.mounted.now.T_body_cam.R
+        R_last_frame = R_body_cam.T @ R_world_last.T @ R_world_frame @ R_body_cam
+        return parallax(a, b, R_last_frame, self._focal) > float(np.radians(self._settings.parallax_deg))
 
     def _drop_second_newest(self) -> None:
         dropped, newest = self.frames.pop(-2), self.frames[-1]
@@ -352,46 +338,44 @@ class Window:
 
     def _marginalize_oldest(self) -> None:
         oldest = self.frames[0]
-        ended = self.points - self.frames[-1].xy.keys()
-        gone = sorted(ended & (self._anchored | oldest.factors.keys()))
-        kept = self._to_anchor(oldest, ended)
-        for i in oldest.factors.keys() - kept - set(gone):  # its other observations count later, with the next oldest
-            del oldest.factors[i], oldest.xy[i]
+        mine = self.points & set(oldest.seen.ids.tolist())
+        ended = self.points - set(self.frames[-1].seen.ids.tolist())
+        gone = ended & (self._anchored | mine)
+        kept = self._to_anchor(mine, ended)
+        # What else the oldest saw counts later, with what the next oldest saw of it.
+        oldest.seen = oldest.seen.among(np.array(sorted(kept | gone), np.int64))
         self._drop_lonely()
-        leaving = [*(L(i) for i in gone if i in self._anchored), V(oldest.k), B(oldest.k), X(oldest.k)]
+        leaving = [*(L(i) for i in sorted(gone & self._anchored)), V(oldest.k), B(oldest.k), X(oldest.k)]
         assert self._prior is not None
         known = [self._prior]
         if self.companion is not None:
             others, more = self.companion.leaving(self, oldest.k)
             leaving, known = [*others, *leaving], [*known, *more]
-        points = gtsam.Ordering([L(i) for i in gone if i not in self._anchored])
-        linear = self._graph_of(oldest, gone).linearize(self.values)
-        rest = linear.eliminatePartialSequential(points)[1]
-        self._prior = equations_of(rest, known, self.values).without(leaving, self.values)
+        seen = self._leaving(oldest, gone, kept).linearised(self.values)
+        equations = equations_of(self._inertial(self.frames[:2]), seen, known, self.values)
+        self._prior, conditional = equations.without(leaving, self.values)
+        if self.history is not None:
+            self.history.left(oldest.k, oldest.t_ns, conditional)
         self._anchored = kept
-        for i in gone:
-            self._forget(i)
+        self._forget(gone)
         for key in leaving:
             if self.values.exists(key):
                 self.values.erase(key)
         self.frames.pop(0)
         self._imu.forget(self.frames[0].t_ns)
 
-    def _graph_of(self, oldest: Frame, gone: list[int]) -> gtsam.NonlinearFactorGraph:
-        """The factors of the oldest frame, and of points that leave with it."""
-        graph, leaving = gtsam.NonlinearFactorGraph(), set(gone)
-        self._add_motion(graph, oldest, self.frames[1])
-        for i in gone:
-            graph.add(self._weak(i))
-        for frame in self.frames:
-            for i, factor in frame.factors.items():
-                if frame is oldest or i in leaving:
-                    graph.add(factor)
-        return graph
+    def _leaving(self, oldest: Frame, gone: set[int], kept: set[int]) -> Sightings:
+        """What the oldest frame sees, and all frames of the points that leave with it."""
+        gone, kept = gone & self.points, kept & set(oldest.seen.ids.tolist())
+        ids = np.array(sorted(gone), np.int64)
+        others = [Frame(frame.k, frame.t_ns, frame.seen.among(ids)) for frame in self.frames[1:]]
+        frames = [oldest, *(frame for frame in others if len(frame.seen.ids))]
+        return self._sightings(frames, gone - self._anchored, kept | (gone & self._anchored), weak=0.0)
 
-    def _to_anchor(self, oldest: Frame, ended: set[int]) -> set[int]:
+    def _to_anchor(self, mine: set[int], ended: set[int]) -> set[int]:
         """Points that stay, with what the oldest frame knew of them: those in the prior, and the longest seen."""
         already = self._anchored - ended
-        rivals = sorted((oldest.factors.keys() & self.points) - ended - already)
-        rivals.sort(key=lambda i: -sum(i in frame.factors for frame in self.frames))
-        return already | set(rivals[: max(0, self._settings.anchored - len(already))])
+        rivals = np.array(sorted(mine - ended - already), np.int64)
+        times = sum((np.isin(rivals, frame.seen.ids).astype(int) for frame in self.frames), np.zeros(len(rivals), int))
+        longest = rivals[np.argsort(-times, kind="stable")]
+        return already | set(longest[: max(0, self._settings.anchored - len(already))].tolist())

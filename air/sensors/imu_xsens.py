@@ -1,6 +1,7 @@
 """Xsens MTi-300 (and other MTi): XBus bytes → `ImuSample`, and the bytes that set the device up.
 
-The housing's frame is x forward, y left, z up, which is `body`. Stamps are the device's 10 kHz counter, unwrapped.
+The housing's frame is x forward, y left, z up, which is `body`. Stamps are the device's 10 kHz counter, unwrapped, at
+the middle of the time over which a sample is the mean.
 Source: Xsens MT0101P, MT Low Level Communication Protocol; MT0605P, MTi User Manual.
 """
 
@@ -19,6 +20,7 @@ from common.measurements import ImuSample, Measurement
 
 RATE_HZ = 200
 TICK_NS = 100_000
+USUAL_PERIOD_NS = 1_000_000_000 // RATE_HZ
 CLIPPED = 0x1FF << 8 | 1 << 19
 """Bits of the status word: an axis of accelerometer, gyroscope or magnetometer is out of range; any of them is."""
 SELF_TEST = 1
@@ -162,7 +164,8 @@ class XsensImu:
             if period_ns is None:
                 return None
             accel, gyro = _rates(increments[0] or (), increments[1] or (), period_ns * 1e-9)
-            t_ns -= period_ns // 2  # an increment is the mean over the period that ends at the sample time
+        # Whatever it gives is the mean over the period that ends at the sample time.
+        t_ns -= (period_ns or USUAL_PERIOD_NS) // 2
         if not all(map(math.isfinite, (*accel, *gyro))):
             self._counts.refused += 1
             return None
