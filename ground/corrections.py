@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -12,7 +10,6 @@ from common import rtcm
 from common.arrays import F64
 from common.bus import Bus
 from common.clock import Clock
-from common.errors import BusError, DeviceError
 from common.geo import T_ecef_enu
 from common.keys import stream_key
 from common.link import Link, open_link
@@ -21,12 +18,12 @@ from common.messages import Datum
 from common.streams import RTCM
 from common.wire import encode
 from ground.config import CorrectionsConfig
-
-log = logging.getLogger(__name__)
+from ground.link_reader import LinkReader
 
 DEVICE = "base"
-RETRY_S = 1.0
 PLACE_EVERY_NS = 10_000_000_000
+ENOUGH_BYTES = 10_000
+"""Among so many there is a frame, or never."""
 _PASSED = {1230, 1033}
 """Besides measurements and places: biases of GLONASS codes, and the kind of receiver."""
 
@@ -73,67 +70,25 @@ class Corrections:
         return due
 
 
-class CorrectionsNode:
-    """A thread that reads a link and publishes what is to be sent; a link that breaks is opened again."""
+class CorrectionsNode(LinkReader):
+    """Publishes what is to be sent."""
 
     def __init__(
         self, config: CorrectionsConfig, bus: Bus, clock: Clock, open_it: Callable[[str, int], Link] = open_link
     ) -> None:
-        self._config, self._bus, self._clock, self._open_it = config, bus, clock, open_it
+        super().__init__("corrections", config.url, config.baud, self._publish, open_it)
+        self._bus, self._clock = bus, clock
         self._key = stream_key(config.vehicle, RTCM)
-        self.sent_bytes = 0
-        self._fault = ""
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="corrections", daemon=True)
+        self._corrections = Corrections(_place(config.position))
 
-    def start(self) -> None:
-        """Begin to read, as soon as the link is there."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop and let go of the link."""
-        self._stopped.set()
-        self._thread.join(timeout=2.0)
-
-    def _run(self) -> None:
-        while not self._stopped.is_set():
-            try:
-                link = self._open_it(self._config.url, self._config.baud)
-            except DeviceError as error:
-                self._note(str(error))
-            else:
-                try:
-                    self._read(link)
-                except OSError as error:
-                    self._note(f"{self._config.url}: {error.strerror or error}")
-                finally:
-                    link.close()
-            self._stopped.wait(RETRY_S)
-
-    def _read(self, link: Link) -> None:
-        corrections = Corrections(_place(self._config.position))
-        while not self._stopped.is_set():
-            data = corrections.feed(link.read(), self._clock.now_ns())
-            if data:
-                self._send(data)
-
-    def _send(self, data: bytes) -> None:
-        try:
-            self._bus.publish(self._key, encode(RawBytes(self._clock.now_ns(), DEVICE, data)), RTCM)
-        except BusError as error:
-            self._note(str(error))
-        else:
-            self.sent_bytes += len(data)
-            self._note("")
-
-    def _note(self, fault: str) -> None:
-        """Log what is wrong, or that nothing is any more, once."""
-        if fault != self._fault:
-            self._fault = fault
-            if fault:
-                log.warning("corrections: %s", fault)
-            else:
-                log.info("corrections: %s is read again", self._config.url)
+    def _publish(self, data: bytes) -> bool:
+        passed = self._corrections.feed(data, self._clock.now_ns())
+        counts = self._corrections.filter.counts
+        if counts.received_bytes > ENOUGH_BYTES and not counts.frames:
+            self._note("no RTCM 3 arrives; check the baud rate, and that the receiver sends it")
+        if passed:
+            self._bus.publish(self._key, encode(RawBytes(self._clock.now_ns(), DEVICE, passed)), RTCM)
+        return bool(passed)
 
 
 def _place(position: tuple[float, ...]) -> F64 | None:

@@ -212,6 +212,14 @@ def test_a_link_that_was_lost_is_read_again(way: Way) -> None:
     wait_until(lambda: way.devices.taken.endswith(FRAMES[-1]))
 
 
+def test_a_receiver_that_speaks_something_else_is_told(way: Way, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    way.station.say(b"$GNGGA,090000.00,3032.13,N,11421.93,E,1,12,0.7,62.0,M,,M,,*5C\r\n" * 300)
+    wait_until(lambda: "no RTCM 3 arrives" in caplog.text)
+    way.station.say(FRAMES[1])
+    wait_until(lambda: "is read again" in caplog.text)
+
+
 def test_what_is_no_correction_is_refused(way: Way) -> None:
     key = all_of(RTCM, "uav1")
 
