@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from typing import Protocol
 
 from air.config import AirConfig
 from air.jump import Jump
 from air.navigation import Navigator
 from air.sources.known import Known
-from common.bus import Bus
 from common.clock import Clock, SystemClock
 from common.errors import BusError, WireError
 from common.keys import message_key
@@ -25,6 +25,14 @@ ROLE = "odometry"
 BEAT_S = 1.0
 
 
+class Publisher(Protocol):
+    """What the node needs of a bus."""
+
+    def publish(self, key: str, payload: bytes, stream: Stream) -> None:
+        """Send bytes under a key with the quality of service of the stream. Raises BusError."""
+        ...
+
+
 class OdometryNode:
     """Measurements in; poses at the rates of their streams, the estimator's state and photos out."""
 
@@ -33,7 +41,7 @@ class OdometryNode:
         config: AirConfig,
         known: Known,
         flight: str,
-        bus: Bus,
+        bus: Publisher,
         map_photo: Callable[[Photo | Jump, Datum], None],
         clock: Clock | None = None,
     ) -> None:

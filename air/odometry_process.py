@@ -9,9 +9,11 @@ import queue
 import signal
 import threading
 import time
+from collections.abc import Callable
 from ctypes import c_ulong
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from logging.handlers import QueueHandler, QueueListener
+from multiprocessing.connection import Connection
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import BoundedSemaphore
 from typing import Any
@@ -19,7 +21,9 @@ from typing import Any
 from air.config import AirConfig
 from air.flight import flight_now
 from air.sources.known import Known
+from common.errors import BusError
 from common.measurements import CameraFrame, ClockState, ImuSample, Measurement, RawBytes
+from common.streams import Stream
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +36,8 @@ STOP_S = 5.0
 LOOK_S = 0.2
 AGAIN_S = 5.0
 """After a start, until the next one: what ends at once must not keep the computer busy."""
+Publish = Callable[[str, bytes, Stream], None]
+"""Of a bus."""
 Dropped = c_ulong
 """Counts; only the one that drops writes it."""
 Item = tuple[float, Measurement] | None
@@ -41,14 +47,16 @@ Item = tuple[float, Measurement] | None
 class OdometryProcess:
     """Follows the aircraft through what its devices measure. The process begins with the first sample or frame.
 
+    What it tells is published by this process: it comes from where its measurements do, to the same listeners.
     Another takes the place of one that has ended by itself, and begins a flight of its own: what the first one knew of
     the world and of the map is gone.
     """
 
-    def __init__(self, config: AirConfig, known: Known) -> None:
-        # It listens nowhere: that is the place of the node of the devices.
+    def __init__(self, config: AirConfig, known: Known, publish: Publish) -> None:
+        # The mapper listens nowhere: that is the place of the node of the devices.
         self._config, self._known = replace(config, bus=replace(config.bus, listen=())), known
-        self._process = _Process(self._config, self._known)
+        self._publish = publish
+        self._process = _Process(self._config, self._known, publish)
         self._lock = threading.Lock()
 
     def take(self, measurement: Measurement) -> None:
@@ -64,7 +72,7 @@ class OdometryProcess:
                 return
             log.error("the odometry has ended with exit code %d: it begins anew", self._process.exitcode)
             self._process.close()
-            self._process = _Process(self._config, self._known)
+            self._process = _Process(self._config, self._known, self._publish)
         self._process.take(measurement)
 
     def finish(self) -> None:
@@ -79,13 +87,15 @@ class OdometryProcess:
 class _Process:
     """One process, with queues of its own: a process that is killed may leave locks of its queues behind."""
 
-    def __init__(self, config: AirConfig, known: Known) -> None:
+    def __init__(self, config: AirConfig, known: Known, publish: Publish) -> None:
         context = multiprocessing.get_context("spawn")
         self._measurements: Queue[Item] = context.Queue(WAITING)
         self._room: BoundedSemaphore = context.BoundedSemaphore(FRAMES)
         self.dropped: Dropped = context.RawValue("L", 0)
         records: Queue[Any] = context.Queue()
-        shared = (self._measurements, self._room, self.dropped, records)
+        told, self._outlet = context.Pipe(duplex=False)
+        self._teller = threading.Thread(target=_pass_on, args=(told, publish), name="told", daemon=True)
+        shared = (self._measurements, self._room, self.dropped, self._outlet, records)
         self._process = context.Process(target=_navigate, args=(config, known, flight_now(), *shared), name="odometry")
         self._listener = QueueListener(records, *logging.getLogger().handlers)
         self.begun_s = 0.0
@@ -109,6 +119,8 @@ class _Process:
             self.begun_s = time.monotonic()
             self._listener.start()
             self._process.start()
+            self._outlet.close()  # so that what it tells ends with the process
+            self._teller.start()
 
     def finish(self) -> None:
         if self._process.pid is not None:
@@ -126,6 +138,32 @@ class _Process:
             self._listener.stop()
 
 
+def _pass_on(told: Connection, publish: Publish) -> None:
+    """Publish what a process tells, until it is gone."""
+    while True:
+        try:
+            key, payload, stream = told.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            publish(key, payload, stream)
+        except BusError as error:
+            log.warning("not published: %s", error)
+
+
+@dataclass(frozen=True)
+class _Outlet:
+    """What the odometry tells goes to the process that it serves."""
+
+    connection: Connection
+
+    def publish(self, key: str, payload: bytes, stream: Stream) -> None:
+        try:
+            self.connection.send((key, payload, stream))
+        except OSError as error:
+            raise BusError(f"{key!r}: the node of the devices is gone") from error
+
+
 def _navigate(
     config: AirConfig,
     known: Known,
@@ -133,6 +171,7 @@ def _navigate(
     measurements: Queue[Item],
     room: BoundedSemaphore,
     dropped: Dropped,
+    outlet: Connection,
     records: Queue[Any],
 ) -> None:
     """The process: until SIGTERM, or until the one that it serves is gone."""
@@ -145,10 +184,9 @@ def _navigate(
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     from air.mapping_process import MappingProcess
     from air.odometry_node import OdometryNode
-    from common.bus import ZenohBus
 
-    bus, mapping = ZenohBus(config.bus), MappingProcess(config, flight)
-    node = OdometryNode(config, known, flight, bus, mapping.take)
+    mapping = MappingProcess(config, flight)
+    node = OdometryNode(config, known, flight, _Outlet(outlet), mapping.take)
     try:
         while not stop.is_set() and (parent is None or parent.is_alive()):
             node.beat(dropped.value)
@@ -166,4 +204,3 @@ def _navigate(
                 node.note_delay(time.monotonic() - put_s)
     finally:
         mapping.close()
-        bus.close()

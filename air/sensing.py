@@ -73,7 +73,7 @@ def sense(config: AirConfig, url: str) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     bus = ZenohBus(config.bus)
-    odometry = OdometryProcess(config, live.known)
+    odometry = OdometryProcess(config, live.known, bus.publish)
     sensing = Sensing(live, bus, config.vehicle, SystemClock(), odometry.take)
     try:
         sensing.run()

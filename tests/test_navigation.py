@@ -259,7 +259,7 @@ def test_an_odometry_that_fails_begins_anew_in_the_same_world() -> None:
 
 
 def test_frames_for_which_there_is_no_room_are_dropped_and_told() -> None:
-    process = OdometryProcess(AirConfig(), Known())
+    process = OdometryProcess(AirConfig(), Known(), lambda *_: None)
     process._process._process = SimpleNamespace(pid=1, exitcode=None)  # type: ignore[assignment]
     for k in range(FRAMES + 3):
         process.take(frame(k, k))
@@ -289,7 +289,7 @@ def is_alive(pid: int) -> bool:
 
 def test_an_odometry_that_was_killed_is_replaced_by_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("air.odometry_process.AGAIN_S", 0.0)
-    process = OdometryProcess(AirConfig(), Known())
+    process = OdometryProcess(AirConfig(), Known(), lambda *_: None)
     sample = ImuSample(1, np.array([0.0, 0.0, 9.8]), np.zeros(3))
     try:
         process.take(sample)
