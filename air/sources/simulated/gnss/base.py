@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from air.gnss.msm_writer import MsmWriter
@@ -22,7 +23,7 @@ class SimulatedBase:
 
     def packets(self) -> Iterator[tuple[float, bytes]]:
         """RTCM frames, each with the true time in s at which its last byte left."""
-        writer, placed_s, line_free_s = MsmWriter(STATION), -PLACE_EVERY_S, 0.0
+        writer, placed_s, line_free_s = MsmWriter(STATION), -math.inf, 0.0
         for observed in self._receiver.observations():
             payloads = writer.messages(observed.epoch)
             if observed.t_s - placed_s >= PLACE_EVERY_S:
