@@ -148,7 +148,7 @@ def test_a_clock_is_a_smooth_function_of_time() -> None:
     ("field", "least"),
     [
         *(("multipath", 0.2), ("code", 0.1), ("orbit", 0.1), ("satellite_clock", 0.1)),
-        *(("ionosphere_residual", 0.2), ("ionosphere_gradient", 0.2), ("ionosphere_ripples", 0.05)),
+        *(("ionosphere_residual", 0.2), ("ionosphere_gradient", 0.2), ("ionosphere_ripples", 0.03)),
     ],
 )
 def test_every_error_has_its_switch(field: str, least: float) -> None:

@@ -39,7 +39,7 @@ from common.measurements import GnssEpoch
 
 SHORTEST_S, LONGEST_LAG_S, STEP_S = 40.0, 60.0, 1.0
 JUMP = 5.0
-TIMES_S = np.geomspace(1.0, 200.0, 60)
+TIMES_S, SLOWEST_S = np.geomspace(1.0, 200.0, 60), 100.0
 ELEVATIONS = (10, 30, 50, 90)
 CN0 = (25, 35, 40, 45, 60)
 SIMULATED_S = 600.0
@@ -61,8 +61,8 @@ def main():
     found = {name: arcs_of(open_source(url)) for name, url in tqdm([*recordings()], leave=False, disable=None)}
     found["simulated, in flight"] = arcs_of(simulated(GnssOptions()))
     found["simulated, base station"] = arcs_of(simulated(GnssOptions.base()))
-    print("| recording | code | arcs | minutes | C/N0, mean, dBHz | σ, m | white, m | stays, m | over, s |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("| recording | code | arcs | minutes | C/N0, dBHz | σ, m | in a second, m | white, m | stays, m | over, s |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for name, arcs in found.items():
         kinds = defaultdict(list)
         for arc in arcs:
@@ -173,22 +173,18 @@ def arc(kind, columns):
 
 
 def parts(arcs):
-    """Arcs, minutes, mean C/N0, σ, white noise, what stays and for how long, as cells."""
+    """Arcs, minutes, mean C/N0, σ, change in a second, white noise, what stays and for how long, as cells."""
     errors, cn0 = np.concatenate([a.error for a in arcs]), np.concatenate([a.cn0 for a in arcs])
-    white, stays, over_s = variogram([(a.t_s, a.error) for a in arcs])
-    minutes = len(errors) * STEP_S / 60
-    sigma = np.sqrt(np.mean(errors**2))
-    return (
-        f"{len(arcs)}",
-        f"{minutes:.0f}",
-        f"{np.mean(cn0):.0f}",
-        *(f"{value:.2f}" for value in (sigma, white, stays)),
-        f"{over_s:.0f}",
-    )
+    series = [(a.t_s, a.error) for a in arcs]
+    change = np.sqrt(gammas(series)[0][0])
+    white, stays, over_s = variogram(series)
+    metres = [f"{value:.2f}" for value in (np.sqrt(np.mean(errors**2)), change, white, stays)]
+    seconds = f"{over_s:.0f}" if over_s < SLOWEST_S else f"> {SLOWEST_S:.0f}"
+    return f"{len(arcs)}", f"{len(errors) * STEP_S / 60:.0f}", f"{np.mean(cn0):.0f}", *metres, seconds
 
 
-def variogram(series):
-    """White noise and what stays, σ, and for how long, s, of series of times and values."""
+def gammas(series):
+    """The variogram (L,) m² of series of times and values at lags of whole seconds, and how many differences it has."""
     lags = np.arange(1, int(LONGEST_LAG_S / STEP_S) + 1)
     total, count = np.zeros(len(lags)), np.zeros(len(lags))
     for t_s, values in series:
@@ -200,17 +196,26 @@ def variogram(series):
             difference = difference[np.isfinite(difference)]
             total[k - 1] += 0.5 * np.sum(difference**2)
             count[k - 1] += len(difference)
-    use = count > 0
-    gamma, weight, lag_s = total[use] / count[use], count[use] / lags[use], lags[use] * STEP_S
+    return total[count > 0] / count[count > 0], count[count > 0], lags[count > 0] * STEP_S
+
+
+def variogram(series):
+    """White noise and what stays, σ, and for how long, s: an exponential fitted to the variogram.
+
+    What stays for longer than the lags tell is given as far as it changes within them.
+    """
+    gamma, count, lag_s = gammas(series)
+    root = np.sqrt(count / lag_s)
     best = (np.inf, 0.0, 0.0, 0.0)
     for over_s in TIMES_S:
         grown = 1 - np.exp(-lag_s / over_s)
         for columns in ((np.ones_like(grown), grown), (np.zeros_like(grown), grown), (np.ones_like(grown), 0 * grown)):
-            A = np.stack(columns, axis=1) * np.sqrt(weight)[:, None]
-            found = np.linalg.lstsq(A, gamma * np.sqrt(weight), rcond=None)[0]
-            cost = float(np.sum((A @ found - gamma * np.sqrt(weight)) ** 2))
+            A = np.stack(columns, axis=1) * root[:, None]
+            found = np.linalg.lstsq(A, gamma * root, rcond=None)[0]
+            cost = float(np.sum((A @ found - gamma * root) ** 2))
             if (found >= 0).all() and cost < best[0]:
-                best = cost, float(np.sqrt(found[0])), float(np.sqrt(found[1])), float(over_s)
+                seen = 1.0 if over_s < SLOWEST_S else grown[-1]
+                best = cost, float(np.sqrt(found[0])), float(np.sqrt(found[1] * seen)), float(over_s)
     return best[1:]
 
 

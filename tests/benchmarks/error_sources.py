@@ -2,7 +2,11 @@
 
 GNSS = {
     "orbits and satellite clocks": {"orbit": 0.0, "satellite_clock": 0.0},
-    "ionosphere beyond the model": {"ionosphere_residual": 0.0},
+    "ionosphere beyond the model": {
+        "ionosphere_residual": 0.0,
+        "ionosphere_gradient": 0.0,
+        "ionosphere_ripples": 0.0,
+    },
     "troposphere beyond the model": {"troposphere_residual": 0.0},
     "receiver's clock": {"clock": 0.0, "clock_drift_ppm": 0.0, "inter_system": 0.0},
     "multipath of the code": {"multipath": 0.0},

@@ -25,21 +25,20 @@ class GnssOptions:
     other systems are better or worse. Air: `ionosphere` and `troposphere` scale the delays of Klobuchar's model, as it
     is broadcast, and of Saastamoinen's. Neither tells, of a satellite at the zenith, `troposphere_residual`, nor of the
     ionosphere `ionosphere_residual`, which all share, `ionosphere_gradient` in m over 1000 km to the north and as much
-    to the east, and `ionosphere_ripples` of each satellite's own. All these stay for tens of minutes and longer.
+    to the east, and `ionosphere_ripples` of each satellite's own. All stay for tens of minutes and more.
     Receiver: `clock` scales the random walk of its oscillator, `clock_drift_ppm` is its largest mean drift;
     `inter_system` is a constant delay of each system; `code`, `phase` and `doppler` (m/s) are white noise at 45 dBHz;
     `multipath` and `carrier_multipath` are correlated over `multipath_s` seconds, and change from half their size at
     the zenith to twice at the horizon; `slips` of each carrier in an hour at 45 dBHz, more when weak; `half_cycle`
     leaves new carriers unresolved for some seconds.
 
-    Where the defaults come from. `tests/benchmarks/bench_multipath.py`, on recordings: multipath of a walking F9P in
-    weak signals 0.3 to 0.8 m, of an M8 on a car 0.2 to 0.3 m, of a static F9T 0.4 to 1 m; it stays for 2 to 9 s on the
-    car and for a minute on the static one; geodetic receivers 0.15 m high up, 0.3 m below 30°. Code of all of these
-    is smoothed: less than 0.1 m is white at 45 dBHz. One static pair of receivers of known places, 300 s of GPS and
-    Galileo: beyond the broadcast ionosphere a zenith of 1.3 m and 2.2 m over 1000 km to the north, 0.4 m for the rest;
-    carriers drift by 0.1 to 0.7 mm/s with satellites' orbits and clocks, by 0.3 to 0.6 with the ionosphere. Klobuchar's
-    model removes half of the ionosphere (IS-GPS-200, 20.3.3.5.2.5), some metres here by day. Orbit and clock: 0.6 m
-    (see `sky`). Wet delay of the troposphere beyond a standard atmosphere: 0.12 m (RTCA DO-229, A.4.2.4).
+    Where the defaults come from. Recordings (`tests/benchmarks/bench_multipath.py`): multipath of a walking F9P in weak
+    signals is 0.3 to 0.8 m, of an M8 on a car 0.2 to 0.3 m, for 2 to 9 s and more; of a static F9T 0.5 m in strong
+    signals and 1 m in weak ones, for a minute; of geodetic antennas 0.2 m high up and 0.3 m below 30°. Receivers
+    smooth the code: 0.05 to 0.25 m is new each second. At two antennas of known places (`bench_slow_errors.py`) the
+    broadcast ionosphere misses 1.2 m at the zenith and 2.2 m over 1000 km to the north, all else of GPS and Galileo
+    is 0.4 m, and carriers drift by 0.2 to 0.7 mm/s. Published: Klobuchar's model takes off half of the ionosphere
+    (IS-GPS-200, 20.3.3.5.2.5); orbits and clocks, see `sky`; troposphere 0.12 m (RTCA DO-229, A.4.2.4).
 
     `outage` and `jamming` are seconds of the flight, such as 60-180 or 60-90,300-330: nothing is received, or C/N0
     falls by `jamming_db`. `fault` satellites, from `fault_start` s on, are late by `fault_bias` and by `fault_ramp`
@@ -57,7 +56,7 @@ class GnssOptions:
     ionosphere: Size = 1.0
     ionosphere_residual: Size = 1.2
     ionosphere_gradient: Size = 0.9
-    ionosphere_ripples: Size = 0.1
+    ionosphere_ripples: Size = 0.05
     troposphere: Size = 1.0
     troposphere_residual: Size = 0.1
     clock: Size = 1.0

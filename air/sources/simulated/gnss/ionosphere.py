@@ -20,8 +20,8 @@ class IonosphereError:
     """
 
     def __init__(self, options: GnssOptions, satellites: int, rng: np.random.Generator):
-        self._zenith = Swing(rng, (1,), options.ionosphere_residual, 7200.0, 21_600.0)
-        self._gradient = Swing(rng, (2,), options.ionosphere_gradient / 1000.0, 7200.0, 21_600.0)
+        self._zenith = Swing(rng, (1,), options.ionosphere_residual, 10_800.0, 32_400.0)
+        self._gradient = Swing(rng, (2,), options.ionosphere_gradient / 1000.0, 10_800.0, 32_400.0)
         self._ripples = Swing(rng, (satellites,), options.ionosphere_ripples, 900.0, 2700.0)
 
     def at(self, t_s: float, apart: F64, azimuth: F64, elevation: F64) -> F64:
