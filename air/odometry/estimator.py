@@ -45,7 +45,7 @@ class Estimate:
     """The state at a frame; covariance (6, 6) of its pose: rotation rad and position m in body axes.
 
     `keyframe` is the state at the frame before when that has become a keyframe. A higher `revision` says that the
-    world frame has jumped. `note` tells what happened, if anything did.
+    world frame has jumped, by `jump` (`T_new_old`) where that is known. `note` tells what happened, if anything did.
     """
 
     state: InertialState
@@ -55,6 +55,7 @@ class Estimate:
     solution: Solution
     keyframe: InertialState | None = None
     note: str = ""
+    jump: SE3 | None = None
 
 
 class Estimator:
@@ -158,16 +159,16 @@ class Estimator:
         self._propagate_from(window.state())
         return self._estimate(window, solution, note="the world has been found by GNSS")
 
-    def _fix(self, window: Window) -> str:
-        """What is to be told when whole cycles of carriers have moved the world."""
-        before = window.state().T_world_body.t
+    def _fix(self, window: Window) -> SE3 | None:
+        """How whole cycles of carriers have moved the world, if they have."""
+        before = window.state().T_world_body
         if not self.gnss.fix(window) or window.solve().failed:
-            return ""
-        jump = float(np.linalg.norm(window.state().T_world_body.t - before))
-        if jump < JUMP:
-            return ""
+            return None
+        after = window.state().T_world_body
+        if np.linalg.norm(after.t - before.t) < JUMP:
+            return None
         self.revision += 1
-        return f"carriers of whole cycles move the world by {jump:.2f} m"
+        return _level_between(before, after)
 
     def _begin_without_frames(self, epoch: CleanEpoch) -> Estimate | None:
         if epoch.t_ns - self._frame_ns < SILENT_S * 1e9:
@@ -261,10 +262,14 @@ class Estimator:
         solution = window.solve()
         if why := self._astray(window, solution, predicted):
             return self._repair(window, frame, predicted, why)
-        note = self._fix(window)
+        before, jump = window.state().T_world_body.t, self._fix(window)
         keyframe = window.state(-2) if window.slide() else None
         self._propagate_from(window.state())
-        return self._estimate(window, solution, keyframe, still, note)
+        estimate = self._estimate(window, solution, keyframe, still)
+        if jump is None:
+            return estimate
+        moved = np.linalg.norm(jump.apply(before) - before)
+        return replace(estimate, jump=jump, note=f"carriers of whole cycles move the world by {moved:.2f} m")
 
     def _estimate(
         self,
