@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from bus_network import free_endpoint, peer_of, router_at, wait_until
+from bus_network import free_endpoint, peer_of, router_at, settle, wait_until
 from gnss_scene import BASE_ECEF
 from rtcm_samples import measured, sent
 
@@ -23,7 +22,7 @@ from common.clock import SystemClock
 from common.config import parse
 from common.errors import ConfigError
 from common.geo import ecef_to_geodetic
-from common.keys import all_of
+from common.keys import stream_key
 from common.measurements import FixKind, GnssEpoch, Measurement, RawBytes, ReceiverSolution
 from common.streams import RTCM
 from common.wire import encode
@@ -152,6 +151,7 @@ class Way:
         self._flying = threading.Thread(target=sensing.run, daemon=True)
         self._flying.start()
         self.devices.told.wait(5.0)
+        settle(self.ground, self.air)
         self.node.start()
 
     @property
@@ -175,38 +175,24 @@ def way() -> Iterator[Way]:
 
 
 def test_what_a_base_measures_reaches_receiver_and_odometry(way: Way) -> None:
-    """What comes before both have found each other is lost; then nothing is, and damage stays at the ground."""
-    place, *frames = FRAMES
-
-    def found() -> bool:
-        way.station.say(place)
-        way.station.say(b"".join(frames[:4]))
-        time.sleep(0.05)
-        return bool(way.devices.taken)
-
-    wait_until(found)
-    damaged = bytearray(frames[4])
+    """All that is whole; damage stays at the ground."""
+    damaged = bytearray(FRAMES[4])
     damaged[20] ^= 1
-    way.station.say(b"noise" + bytes(damaged) + b"".join(frames[4:]))
-    wait_until(lambda: way.devices.taken.endswith(frames[-1]))
+    way.station.say(b"noise" + bytes(damaged) + b"".join(FRAMES))
+    wait_until(lambda: way.devices.taken.endswith(FRAMES[-1]))
     assert b"noise" not in way.devices.taken
     assert bytes(damaged) not in way.devices.taken
-    expected = {round(epoch.t_ns, -6): len(epoch.satellites) for epoch in measured(SECONDS)[2:]}
-    wait_until(lambda: expected.keys() <= {epoch.t_ns for epoch in way.epochs})
-    for epoch in way.epochs:
-        assert epoch.receiver == "base"
-        assert len(epoch.satellites) == expected.get(epoch.t_ns, len(epoch.satellites))
+    wait_until(lambda: len(way.epochs) == SECONDS)
+    for epoch, told in zip(way.epochs, measured(SECONDS), strict=True):
+        assert (epoch.receiver, epoch.t_ns) == ("base", round(told.t_ns, -6))
+        assert len(epoch.satellites) == len(told.satellites)
         assert epoch.p_ecef is not None
         np.testing.assert_allclose(epoch.p_ecef, BASE_ECEF, atol=1e-4)
 
 
 def test_a_link_that_was_lost_is_read_again(way: Way) -> None:
-    def found() -> bool:
-        way.station.say(FRAMES[1])
-        time.sleep(0.05)
-        return bool(way.devices.taken)
-
-    wait_until(found)
+    way.station.say(FRAMES[1])
+    wait_until(lambda: bool(way.devices.taken))
     way.station.hang_up()
     way.station.say(b"".join(FRAMES[5:]))
     wait_until(lambda: way.devices.taken.endswith(FRAMES[-1]))
@@ -221,14 +207,10 @@ def test_a_receiver_that_speaks_something_else_is_told(way: Way, caplog: pytest.
 
 
 def test_what_is_no_correction_is_refused(way: Way) -> None:
-    key = all_of(RTCM, "uav1")
-
-    def arrived() -> bool:
-        for payload in (b"\x93", encode(RawBytes(1, "base", b"\xd3\x00\x13 no frame"))):
-            way.ground.publish(key, payload, RTCM)
-        return bool(way.devices.taken)
-
-    wait_until(arrived)
+    key = stream_key("uav1", RTCM)
+    for payload in (b"\x93", encode(RawBytes(1, "base", b"\xd3\x00\x13 no frame"))):
+        way.ground.publish(key, payload, RTCM)
+    wait_until(lambda: bool(way.devices.taken))
     assert way.epochs == []
 
 
@@ -236,16 +218,10 @@ def test_a_surveyed_position_arrives_instead_of_the_receivers() -> None:
     """1e-9 degrees are 0.1 mm."""
     surveyed = BASE_ECEF + (3.0, 0.0, 0.0)
     way = Way(tuple(round(float(x), 9) for x in ecef_to_geodetic(surveyed)))
-    epochs = iter(range(0, len(FRAMES), 4))
-
-    def found() -> bool:
-        at = next(epochs)
-        way.station.say(b"".join(FRAMES[at : at + 4]))
-        time.sleep(0.05)
-        return any(epoch.p_ecef is not None for epoch in way.epochs)
-
     try:
-        wait_until(found)
-        np.testing.assert_allclose(way.epochs[-1].p_ecef, surveyed, atol=3e-4)  # type: ignore[arg-type]
+        way.station.say(b"".join(FRAMES))
+        wait_until(lambda: len(way.epochs) == SECONDS)
+        for epoch in way.epochs:
+            np.testing.assert_allclose(epoch.p_ecef, surveyed, atol=3e-4)  # type: ignore[arg-type]
     finally:
         way.close()
