@@ -224,7 +224,7 @@ def test_poses_go_out_at_the_rates_of_their_streams_and_photos_to_the_mapper(
     bus, photos = _Bus(), list[tuple[Photo, Datum]]()
     node = OdometryNode(AirConfig(), known_of(flown), "flight", bus, lambda *taken: photos.append(taken))  # type: ignore[arg-type]
     again = iter(told_each)
-    node._navigator = SimpleNamespace(feed=lambda _: next(again))  # type: ignore[assignment]
+    node._navigator.feed = lambda _: next(again)  # type: ignore[method-assign]
     for measurement in sensed(flown):
         node.take(measurement)  # type: ignore[arg-type]
     node.beat(0)
