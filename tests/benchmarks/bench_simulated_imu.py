@@ -1,6 +1,6 @@
 """The simulated flight and its IMU: Allan deviations, what a perfect IMU integrates to, what wind does, and CPU time.
 
-python tests/benchmarks/bench_flight.py [--seconds 3600]
+python tests/benchmarks/bench_simulated_imu.py [--seconds 3600]
 """
 
 import argparse
