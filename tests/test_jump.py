@@ -18,11 +18,15 @@ from air.jump import Jump
 from air.live import LiveMap
 from air.mapping.settings import MappingSettings
 from air.mapping_process import WAITING, MappingProcess, Taken
+from air.navigation import Navigator
+from air.odometry.settings import OdometrySettings
 from air.preparation import prepared
+from air.sources.known import known_of
 from air.sources.simulated.survey import Survey, SurveyOptions
+from air.sources.source import open_source
 from common.arrays import F64
 from common.geo import T_world_other
-from common.messages import Datum, GnssFix, MapTile, Photo
+from common.messages import Datum, GnssFix, MapTile, Photo, Pose
 from common.se3 import SE3, rotation_vector_to_matrix
 from common.wire import encode
 from ground.cloud import Cloud
@@ -86,6 +90,25 @@ def test_a_mapper_that_is_behind_gets_every_jump() -> None:
     assert len(taken) == WAITING + 1
     assert isinstance(taken[-1], Jump)
     process._photos.cancel_join_thread()
+
+
+@pytest.mark.slow
+def test_a_jump_is_told_between_the_poses_of_the_old_world_and_those_of_the_new() -> None:
+    """With a base station carriers become whole cycles soon after the world was found by code, and move it."""
+    source = open_source("sim:plain?duration=40&flight.start=air&seed=3")
+    navigator = Navigator(known_of(source), "flight", OdometrySettings())
+    told = [message for measurement in source for message in navigator.feed(measurement)]
+    jumps = [k for k, message in enumerate(told) if isinstance(message, Jump)]
+    assert jumps
+    assert navigator.datum is not None
+    for k in jumps:
+        found = told[k]
+        assert isinstance(found, Jump)
+        before = next(m for m in reversed(told[:k]) if isinstance(m, Pose))
+        after = next(m for m in told[k:] if isinstance(m, Pose))
+        assert (before.revision, after.revision) == (found.revision - 1, found.revision)
+        p = before.T_world_body.t
+        assert 0.1 < np.linalg.norm(found.at(navigator.datum).apply(p) - p) < 5.0
 
 
 # The map

@@ -192,6 +192,8 @@ class Odometry:
         if (datum := self.estimator.gnss.datum) is not None and datum is not self._datum:
             self._datum = datum
             out.append(datum)
+        if estimate.jump is not None and self._datum is not None:
+            out.append(Jump(estimate.state.t_ns, estimate.revision, self._datum, estimate.jump))
         if estimate.keyframe is not None and self._calibration is not None:
             out.append(self._keyframe(estimate.keyframe, self._calibration.camera))
         if estimate.state.t_ns - self._told_ns >= EVERY_NS:
