@@ -111,3 +111,11 @@ def skew(v: F64) -> F64:
     """Cross-product matrix (3, 3): `skew(v) @ u == cross(v, u)`."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def level_between(now: SE3, wanted: SE3) -> SE3:
+    """`T_wanted_now`, a turn about the vertical and a shift, that takes one pose as near as it can to another."""
+    turn = wanted.R @ now.R.T
+    yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    R = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    return SE3(R, wanted.t - R @ now.t)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import gtsam
@@ -35,14 +36,21 @@ def ideal(frame: TrackedFrame) -> Seen:
 
 
 def flown(
-    seed: int, duration_s: float, settings: WindowSettings | None = None, spoil: float = 0.0, stop_after: int = 10**9
+    seed: int,
+    duration_s: float,
+    settings: WindowSettings | None = None,
+    spoil: float = 0.0,
+    stop_after: int = 10**9,
+    prepared: Callable[[Window, ImuBuffer], None] = lambda *_: None,
+    meanwhile: Callable[[int], None] = lambda _: None,
 ) -> tuple[Window, Scene, F64, F64]:
     """A window that flew from a known start, its positions and the true ones (N, 3); `spoil` is the share of wild
-    observations."""
+    observations. `prepared` is given the window first, `meanwhile` the number of each frame."""
     scene = Scene(seed, duration_s, FlightOptions(start="air"), ImuOptions())
     buffer, rng = ImuBuffer(IMU), np.random.default_rng(seed)
     window = Window(CAMERA.fx, EXACT, buffer, settings or WindowSettings(), IMU)
     estimate, truth, waiting = [], [], []
+    prepared(window, buffer)
     for message in scene.sensed():
         if isinstance(message, ImuSample):
             buffer.add(message)
@@ -62,6 +70,7 @@ def flown(
             estimate.append(window.state().T_world_body.t)
             truth.append(scene.state(frame.t_ns).T_world_body.t)
             window.slide()
+            meanwhile(len(estimate))
     return window, scene, np.array(estimate), np.array(truth)
 
 

@@ -155,6 +155,7 @@ def test_stamps_are_true_to_a_millisecond_from_jittery_arrivals() -> None:
     true_s = np.concatenate([batch.t_s for batch in source.aircraft.imu().batches()])
     measurements = list(source)
     told_s = np.array([m.t_ns - source.aircraft.start_ns for m in of(ImuSample, measurements)]) * 1e-9
+    true_s -= source.aircraft.options.imu.delay_s  # of the middle of each sample
     error_s = told_s - true_s[len(true_s) - len(told_s) - 1 : -1]  # the last one is on its way when the flight ends
     signals = [len(m.satellites) for m in of(GnssEpoch, measurements)]
     assert np.ptp(signals) > 20

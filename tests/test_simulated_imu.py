@@ -60,6 +60,7 @@ def test_a_perfect_imu_integrated_for_a_minute_returns_to_the_truth(earth_rate: 
     trajectory = flight(75.0, start="air", length=40.0, spacing=8.0)
     t_s, accel, gyro = felt(simulated(trajectory, replace(PERFECT, earth_rate=earth_rate)))
     first, step_s = 1000, 1 / RATE_HZ
+    t_s -= PERFECT.delay_s
     at = trajectory.at(np.array([t_s[first] - step_s / 2]))
     p, v, R = at.p_world[0], at.v_world[0], at.R_world_body[0]
     earth = earth_rate * earth_rate_enu(DATUM.latitude_deg)

@@ -19,7 +19,8 @@ _CAMERA = re.compile(r"/.+|realsense(:\w+)?")
 class PortConfig:
     """A device behind a serial port, a TCP or UDP address, or nothing; `baud` counts for serial ports alone.
 
-    `delay_s` is the least time from sampling to arrival; for a receiver on a serial line, to its epoch's first byte.
+    `delay_s` is the least time from sampling (of an IMU, the middle of a sample) to arrival; for a receiver on a serial
+    line, to its epoch's first byte.
     """
 
     port: str = ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 from air.odometry.quadratic import Conditional, Quadratic
-from common.se3 import SE3
 
 if TYPE_CHECKING:
     from air.odometry.window import Window
@@ -29,14 +28,14 @@ class Companion(Protocol):
 class History(Protocol):
     """Somebody who remembers what left the window, to know it better afterwards."""
 
-    def begun(self, k: int) -> None:
-        """The window begins anew with frame k."""
+    def left(self, window: Window, conditional: Conditional) -> None:
+        """The oldest frame is about to leave, with others that nobody needs any more."""
         ...
 
-    def left(self, k: int, t_ns: int, conditional: Conditional) -> None:
-        """Frame k has left, with others that nobody needs any more."""
+    def moving(self, window: Window) -> None:
+        """Another world is about to begin for all that the window holds."""
         ...
 
-    def moved(self, newest: int, T_new_world: SE3) -> None:
-        """All that was in the window, frame `newest` last, is in another world from now on."""
+    def ended(self, window: Window) -> None:
+        """What the window holds stays as it is: it begins anew, or not at all."""
         ...

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from air.odometry.companion import History
 from air.odometry.degradation import Monitor
 from air.odometry.gnss_coupling import GnssCoupling
 from air.odometry.gnss_preprocessing import CleanEpoch
@@ -26,7 +27,7 @@ from air.odometry.window import Solution, Window
 from common.arrays import F64
 from common.measurements import ImuSample
 from common.messages import Mode
-from common.se3 import SE3
+from common.se3 import SE3, level_between
 
 AGAIN = Sigmas(tilt=0.02, yaw=0.02, position=0.5, velocity=0.5, accel_bias=0.05, gyro_bias=0.005)
 """How well the IMU's prediction is known where the window starts anew."""
@@ -87,6 +88,8 @@ class Estimator:
         self._recent: list[TrackedFrame] = []
         self._repaired_ns = -(10**18)
         self.revision = 0
+        self.history: History | None = None
+        """Who remembers what leaves the window; set before the flight begins."""
 
     def _new_initialization(self) -> Initialization:
         return Initialization(self._focal, self._T_body_cam, self.buffer, self._settings)
@@ -168,7 +171,7 @@ class Estimator:
         if np.linalg.norm(after.t - before.t) < JUMP:
             return None
         self.revision += 1
-        return _level_between(before, after)
+        return level_between(before, after)
 
     def _begin_without_frames(self, epoch: CleanEpoch) -> Estimate | None:
         if epoch.t_ns - self._frame_ns < SILENT_S * 1e9:
@@ -188,10 +191,14 @@ class Estimator:
         return self._estimate(window, Solution(0.0, 0, 0), note="begins in motion, without a camera")
 
     def _new_window(self) -> Window:
-        return Window(self._focal, self.mounted, self.buffer, self._settings.window, self._settings.imu)
+        window = Window(self._focal, self.mounted, self.buffer, self._settings.window, self._settings.imu)
+        window.history = self.history
+        return window
 
     def _lose_window(self) -> None:
         """What follows begins from nothing, but for what satellites broadcast and what was learnt of the mounting."""
+        if self.history is not None and self._window is not None:
+            self.history.ended(self._window)
         self._window, self._initialization = None, self._new_initialization()
         self.gnss.leave()
 
@@ -250,7 +257,7 @@ class Estimator:
 
     def _join(self, window: Window, before: InertialState) -> None:
         """Place what began anew where the IMU says that the aircraft is."""
-        window.move(_level_between(window.state().T_world_body, before.T_world_body), JOINED)
+        window.move(level_between(window.state().T_world_body, before.T_world_body), JOINED)
         self.revision += 1
 
     def _continue(self, window: Window, frame: TrackedFrame) -> Estimate | Refusal:
@@ -351,11 +358,3 @@ def blind_frame(t_ns: int) -> TrackedFrame:
     """A frame that shows nothing."""
     none = np.zeros(0)
     return TrackedFrame(t_ns, none.astype(np.int64), np.zeros((0, 2)), np.zeros((0, 3)), none, none.astype(bool), True)
-
-
-def _level_between(now: SE3, wanted: SE3) -> SE3:
-    """The transform, a turn about the vertical and a shift, that takes one pose as near as it can to another."""
-    turn = wanted.R @ now.R.T
-    yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-    R = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-    return SE3(R, wanted.t - R @ now.t)

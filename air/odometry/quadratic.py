@@ -36,10 +36,10 @@ class Quadratic:
     def at(self, values: gtsam.Values) -> Quadratic:
         """The same function of the change from other values."""
         now = {key: variable(values, key) for key in self.point}
-        moved = np.concatenate([_moved(then, now[key]) for key, then in self.point.items()])
-        G_moved = self.G @ moved
-        f = self.f - 2 * self.g @ moved + moved @ G_moved
-        g, G = self.g - G_moved, self.G
+        step = np.concatenate([moved(then, now[key]) for key, then in self.point.items()])
+        G_step = self.G @ step
+        f = self.f - 2 * self.g @ step + step @ G_step
+        g, G = self.g - G_step, self.G
         G = G.copy()
         for columns, R_then_now in _turns(self.point, now):
             _turn(G, g, columns, R_then_now)
@@ -47,8 +47,8 @@ class Quadratic:
 
     def error(self, values: gtsam.Values) -> float:
         """Its value at some values."""
-        moved = np.concatenate([_moved(then, variable(values, key)) for key, then in self.point.items()])
-        return float(self.f - 2 * self.g @ moved + moved @ self.G @ moved) / 2
+        step = np.concatenate([moved(then, variable(values, key)) for key, then in self.point.items()])
+        return float(self.f - 2 * self.g @ step + step @ self.G @ step) / 2
 
     def beside(self, other: Quadratic) -> Quadratic:
         """This and another one of other variables together."""
@@ -187,7 +187,16 @@ def _flat(then: Variable) -> F64:
     return np.zeros(6) if isinstance(then, gtsam.Pose3) else then
 
 
-def _moved(then: Variable, now: Variable) -> F64:
+def retracted(then: Variable, change: F64) -> Variable:
+    """A variable after a change (D,)."""
+    if not isinstance(then, gtsam.Pose3):
+        return then + change
+    R, t = then.rotation(), then.translation()
+    return gtsam.Pose3(R.compose(gtsam.Rot3.Expmap(change[:3])), t + R.matrix() @ change[3:])
+
+
+def moved(then: Variable, now: Variable) -> F64:
+    """The change (D,) from one value of a variable to another."""
     if not isinstance(then, gtsam.Pose3):
         return np.asarray(now - then)
     turned = gtsam.Rot3.Logmap(then.rotation().between(now.rotation()))

@@ -113,6 +113,8 @@ class Window:
 
         What has been learnt of the mounting stays.
         """
+        if self.history is not None and self.frames:
+            self.history.ended(self)
         k = self.frames[-1].k + 1 if self.frames else 0
         self.values, self.frames, self.points, self._anchored = gtsam.Values(), [], set(), set()
         self._insert(k, state)
@@ -120,8 +122,6 @@ class Window:
         self.frames.append(Frame(k, state.t_ns, seen))
         self._prior = initial_prior(k, state, covariance, self._imu_settings).beside(self.mounted.prior())
         self._covariance = covariance[:6, :6]
-        if self.history is not None:
-            self.history.begun(k)
 
     def predict(self, t_ns: int, index: int = -1) -> InertialState:
         """Where the state of a frame, by default of the newest, leads to by the IMU."""
@@ -209,6 +209,8 @@ class Window:
     def move(self, T_new_world: SE3, covariance: F64) -> None:
         """Turn everything about the vertical and shift it; `covariance` (4, 4) is of the shift m and the turn rad."""
         assert self._prior is not None
+        if self.history is not None:
+            self.history.moving(self)
         self._prior = self._prior.carried(T_new_world, covariance)
         moving = [key for f in self.frames for key in (X(f.k), V(f.k))] + [L(i) for i in self.points]
         for key in moving:
@@ -355,7 +357,7 @@ class Window:
         equations = equations_of(self._inertial(self.frames[:2]), seen, known, self.values)
         self._prior, conditional = equations.without(leaving, self.values)
         if self.history is not None:
-            self.history.left(oldest.k, oldest.t_ns, conditional)
+            self.history.left(self, conditional)
         self._anchored = kept
         self._forget(gone)
         for key in leaving:

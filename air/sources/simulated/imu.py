@@ -84,7 +84,7 @@ class ImuOptions:
 _ERRORS = (
     *("accel_noise_ug", "gyro_noise_deg_s", "accel_bias_mg", "gyro_bias_deg_h", "accel_turn_on_mg"),
     *("gyro_turn_on_deg_s", "accel_scale", "gyro_scale", "misalignment_deg", "g_sensitivity_deg_s"),
-    *("accel_range_g", "gyro_range_deg_s", "vibration", "vibration_deg_s", "delay_s"),
+    *("accel_range_g", "gyro_range_deg_s", "vibration", "vibration_deg_s"),
     *("tilt_deg", "heading_deg", "magnetic", "lost"),
 )
 """What is 0 in a perfect device."""
