@@ -1,7 +1,7 @@
 """From the raw measurements of an epoch to those that the odometry can believe.
 
 Elevation mask, satellites seen for a while, C/N0 and standard-deviation gates, residual tests, and both bands as one:
-the mean of their codes and Dopplers, and the carrier free of the ionosphere where both are locked. Sources: Cao, Lu,
+codes and carriers free of the ionosphere where both are there, and the mean of the Dopplers. Sources: Cao, Lu,
 Shen, GVINS (2022), section IV; Misra and Enge, Global Positioning System, 5.7.
 """
 
@@ -25,6 +25,9 @@ from common.measurements import GnssEpoch
 _LOW = np.radians(20.0)
 _NOMINAL_CN0 = 45.0
 _GLONASS = 1.5
+_ORBIT = {"E": 0.4, "C": 1.7, "R": 3.0}
+"""Orbit and clock as broadcast, in units of those of GPS: O. Montenbruck, P. Steigenberger, A. Hauschild, Multi-GNSS
+signal-in-space range error assessment (2018), table 3."""
 _UNTOLD = 3.0
 """Least sigma of a satellite's clock, m, where nobody tells by how much its signals are late."""
 _LEAST = 0.7
@@ -159,13 +162,15 @@ class GnssPreprocessor:
         second = {name: i for i, name in enumerate(signals.satellites) if not signals.first[i] and usable[i]}
         first = [i for i in range(len(signals.satellites)) if signals.first[i] and usable[i]]
         rows = [measured.of(i, second.get(signals.satellites[i])) for i in first]
-        code, carrier, rate, sigma, sigma_carrier, bend, own = np.array([row[:7] for row in rows]).reshape(-1, 7).T
-        elevation = signals.elevation[first]
+        elevation, slant = signals.elevation[first], signals.slant[first]
         ending = DIFFERENTIAL if measured.differential else ""
         systems = tuple(signals.clocks[i] + ending for i in first)
-        glonass = np.array([name[0] == "R" for name in systems], bool)
-        orbit = np.where(signals.told[first], noise.orbit, max(noise.orbit, _UNTOLD))
-        air = np.hypot(noise.ionosphere * bend * signals.slant[first], noise.troposphere / np.sin(elevation))
+        system = [signals.satellites[i][0] for i in first]
+        orbit = noise.orbit * np.array([_ORBIT.get(name, 1.0) for name in system])
+        orbit = np.where(signals.told[first], orbit, np.maximum(orbit, _UNTOLD))
+        air = np.hypot(noise.ionosphere * _of(rows, "air") * slant, noise.troposphere / np.sin(elevation))
+        drift = np.hypot(noise.orbit_drift, noise.drift * slant * _of(rows, "air_drift"))
+        glonass = np.where([name == "R" for name in system], _GLONASS, 1.0)
         left = noise.differential if measured.differential else 1.0
         return CleanEpoch(
             t_ns=t_ns,
@@ -173,18 +178,18 @@ class GnssPreprocessor:
             systems=systems,
             p_satellite=signals.p_satellite[first],
             v_satellite=signals.v_satellite[first],
-            code=code,
-            carrier=carrier,
-            rate=rate,
-            arcs=tuple(row[7] for row in rows),
-            sigma_code=noise.code * sigma * np.where(glonass, _GLONASS, 1.0),
-            sigma_carrier=noise.carrier * sigma_carrier,
-            sigma_rate=noise.rate * sigma,
-            sigma_multipath=noise.multipath * (0.5 + 1.5 * np.exp(-elevation / _LOW)) * _share(second, signals, first),
+            code=_of(rows, "code"),
+            carrier=_of(rows, "carrier"),
+            rate=_of(rows, "rate"),
+            arcs=tuple(row.arc for row in rows),
+            sigma_code=noise.code * _of(rows, "code_noise") * glonass,
+            sigma_carrier=noise.carrier * _of(rows, "carrier_noise"),
+            sigma_rate=noise.rate * _of(rows, "rate_noise"),
+            sigma_multipath=noise.multipath * (0.5 + 1.5 * np.exp(-elevation / _LOW)) * _of(rows, "multipath"),
             sigma_slow=np.hypot(orbit, air) * left,
-            sigma_drift=np.hypot(noise.orbit_drift, noise.drift * signals.slant[first] * bend * own) * left,
+            sigma_drift=drift * left,
             elevation=elevation,
-            offset=carrier - code,
+            offset=_of(rows, "carrier") - _of(rows, "code"),
             fix=fix,
         )
 
@@ -204,9 +209,25 @@ class GnssPreprocessor:
         return replace(clean, code=np.where(wild, np.nan, clean.code))
 
 
-_Row = tuple[float, float, float, float, float, float, float, str]
-"""Code, carrier m, rate m/s; sigmas of code and carrier in units of their own; bend of the ionosphere in the code; 1
-where the ionosphere is in the carrier; the carrier's arc."""
+@dataclass(frozen=True)
+class _Row:
+    """The bands of a satellite as one: `code`, `carrier` m and `rate` m/s, and what spoils these in units of a single
+    signal in the zenith. `air` is by how much the ionosphere is in the code, `air_drift` in Doppler and carrier."""
+
+    code: float
+    rate: float
+    code_noise: float
+    rate_noise: float
+    multipath: float
+    air: float
+    carrier: float = np.nan
+    carrier_noise: float = np.nan
+    air_drift: float = 1.0
+    arc: str = ""
+
+
+def _of(rows: list[_Row], name: str) -> F64:
+    return np.array([getattr(row, name) for row in rows], float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,32 +250,43 @@ class _Measured:
         return _Measured(signals, arcs, self.sigma, True, base.arc), both
 
     def of(self, i: int, j: int | None) -> _Row:
-        """The signal `i` of the first band and, where there is one, `j` of the second as one row."""
-        s, name = self.signals, self.signals.satellites[i]
-        bands = [i] if j is None else [i, j]
-        loud = self.sigma[bands]
-        shared = float(s.code[bands].mean()), float(s.rate[bands].mean()), float(np.hypot.reduce(loud)) / len(bands)
-        code, rate, sigma = shared
-        bend = float(s.bend[bands].mean())
+        """The signal `i` of the first band and, where there is one, `j` of the second as one row.
+
+        The ionosphere is taken out where both bands are there, by the combination that is free of it; from differences
+        to a base station it is gone already.
+        """
+        s, name, loud = self.signals, self.signals.satellites[i], self.sigma
+        bend = float(s.bend[i])
+        if j is None:
+            noise = float(loud[i])
+            row = _Row(float(s.code[i]), float(s.rate[i]), noise, noise, 1.0, bend, air_drift=bend)
+        else:
+            bands = [i, j]
+            f1, f2 = s.frequency[bands] ** 2
+            mean = np.array([0.5, 0.5])
+            free = mean if self.differential else np.array([f1, -f2]) / (f1 - f2)
+            row = _Row(
+                code=float(free @ s.code[bands]),
+                rate=float(mean @ s.rate[bands]),
+                code_noise=float(np.linalg.norm(free * loud[bands])),
+                rate_noise=float(np.linalg.norm(mean * loud[bands])),
+                multipath=float(np.linalg.norm(free)),
+                air=float(mean @ s.bend[bands]) if self.differential else 0.0,
+                air_drift=float(mean @ s.bend[bands]),
+            )
         if self.arcs[i] < 0:
-            return code, np.nan, rate, sigma, np.nan, bend, 1.0, ""
+            return row
+        first = replace(row, carrier=float(s.carrier[i]), carrier_noise=float(loud[i]))
         if self.base_arcs is not None:
-            arc = f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base_arcs[i]}"
-            return code, float(s.carrier[i]), rate, sigma, float(loud[0]), bend, 0.0, arc
+            return replace(first, air_drift=0.0, arc=f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base_arcs[i]}")
         if j is None or self.arcs[j] < 0:
-            return code, float(s.carrier[i]), rate, sigma, float(loud[0]), bend, 1.0, f"{name}/{self.arcs[i]}"
-        f1, f2 = s.frequency[bands] ** 2
-        a, b = f1 / (f1 - f2), -f2 / (f1 - f2)
-        free = float(a * s.carrier[i] + b * s.carrier[j])
-        return (
-            code,
-            free,
-            rate,
-            sigma,
-            float(np.hypot(*(a, b) * loud)),
-            bend,
-            0.0,
-            f"{name}/{self.arcs[i]}+{self.arcs[j]}",
+            return replace(first, air_drift=bend, arc=f"{name}/{self.arcs[i]}")
+        return replace(
+            row,
+            carrier=float(free @ s.carrier[bands]),
+            carrier_noise=float(np.linalg.norm(free * loud[bands])),
+            air_drift=0.0,
+            arc=f"{name}/{self.arcs[i]}+{self.arcs[j]}",
         )
 
 
@@ -262,8 +294,3 @@ def _loudness(cn0: F64) -> F64:
     """Sigma (M,) of white noise in units of that at 45 dBHz."""
     known = np.clip(np.where(np.isnan(cn0), _NOMINAL_CN0, cn0), 0.0, 60.0)
     return np.maximum(10 ** ((_NOMINAL_CN0 - known) / 20), _LEAST)
-
-
-def _share(second: dict[str, int], signals: Signals, first: list[int]) -> F64:
-    """What is left (N,) of multipath where codes of two bands are averaged."""
-    return np.array([np.sqrt(0.5) if signals.satellites[i] in second else 1.0 for i in first])

@@ -37,30 +37,30 @@ class GnssSelection:
 class GnssNoise:
     """One sigma of each error, m unless said otherwise, at 45 dBHz and in the zenith, where that matters.
 
-    `code`, `carrier`, `rate` (m/s) are white. Of each satellite: `multipath` of the code, correlated over
-    `multipath_s`, as its elevation lets it grow; `orbit` with the satellite's clock, and `ionosphere` and
+    `code`, `carrier`, `rate` (m/s) are white; `carrier` is larger than its noise, as its millimetres of multipath stay
+    alike over hundreds of epochs. Of each satellite: `multipath` of the code, correlated over
+    `multipath_s`, as its elevation lets it grow; `orbit` with the satellite's clock, of GPS, and `ionosphere` and
     `troposphere` beyond the models, all together over `slow_s`. How fast these change, Doppler and carrier see: by
     `orbit_drift` m/s, and by `drift` m/s where the ionosphere is in it, over `drift_s`; a carrier's ambiguity wanders
     by `ambiguity_walk` m/√s besides, and the delay between two systems by `system_walk` m/√s. Differences to a base
-    station keep the share `differential` of what is slow. Residuals beyond
-    `robust` sigmas lose weight.
+    station keep the share `differential` of what is slow. Residuals beyond `robust` sigmas lose weight.
     """
 
-    code: Sigma = 0.4
-    carrier: Sigma = 0.004
+    code: Sigma = 0.15
+    carrier: Sigma = 0.02
     rate: Sigma = 0.04
-    multipath: Sigma = 3.5
-    multipath_s: Seconds = 60.0
-    orbit: Sigma = 0.8
-    ionosphere: Sigma = 1.0
-    troposphere: Sigma = 0.15
-    slow_s: Seconds = 1800.0
-    drift: Sigma = 0.003
-    orbit_drift: Sigma = 0.0005
-    drift_s: Seconds = 600.0
+    multipath: Sigma = 0.6
+    multipath_s: Seconds = 30.0
+    orbit: Sigma = 0.6
+    ionosphere: Sigma = 1.2
+    troposphere: Sigma = 0.12
+    slow_s: Seconds = 2700.0
+    drift: Sigma = 0.0008
+    orbit_drift: Sigma = 0.0004
+    drift_s: Seconds = 2500.0
     ambiguity_walk: Sigma = 0.001
     system_walk: Sigma = 0.01
-    differential: Annotated[float, Range(0.0, 1.0)] = 0.05
+    differential: Annotated[float, Range(0.0, 1.0)] = 0.02
     robust: Annotated[float, Range(1.0, 100.0)] = 4.0
 
 

@@ -20,7 +20,8 @@ def without(flight, kinds, begin_s, end_s):
     """The flight without measurements of some kinds from `begin_s` to `end_s`."""
 
     def is_left(message):
-        return not (isinstance(message, kinds) and begin_s <= flight.seconds(message.t_ns) < end_s)
+        t_ns = getattr(message, "t_ns", None)
+        return t_ns is None or not (isinstance(message, kinds) and begin_s <= flight.seconds(t_ns) < end_s)
 
     return replace(flight, messages=[message for message in flight.messages if is_left(message)])
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from air.odometry.estimator import Estimate
-from air.odometry.odometry import Odometry
+from air.odometry.odometry import BASE, Odometry
 from air.odometry.settings import OdometrySettings
+from air.odometry.smoothing import Smoother, between
 from air.odometry.tracker import TrackedFrame
 from common.geo import T_world_other
-from common.measurements import ImuSample
+from common.measurements import GnssEpoch, ImuSample
 from common.se3 import rotation_vector
 from ground.evaluation.similarity import umeyama
 
@@ -26,13 +27,15 @@ class Run:
     """Poses since the world was found, in the truth's world, each as it was told at its time.
 
     `t_s` (N,), `error` (N, 3) m east, north, up, `p` (N, 3) m the true positions, `turn_deg` (N, 3) the error of the
-    attitude about the same axes, `nees` (N,) of the position, `modes` (N,). `frame_s` is the CPU time of each frame
+    attitude about the same axes, `nees` (N,) of the position, `modes` (N,). `smoothed_error` (N, 3) m is that of the
+    path as it was known afterwards. `frame_s` is the CPU time of each frame
     from image to pose, `cpu_s` of everything, over `seconds` of flight. `moving_s` is when it begins to move.
     """
 
     t_s: np.ndarray
     p: np.ndarray
     error: np.ndarray
+    smoothed_error: np.ndarray
     turn_deg: np.ndarray
     nees: np.ndarray
     modes: list
@@ -41,9 +44,9 @@ class Run:
     seconds: float
     moving_s: float
 
-    def left(self):
+    def left(self, smoothed=False):
         """Distances (N,) m that remain after a rigid alignment."""
-        ours = self.p + self.error
+        ours = self.p + (self.smoothed_error if smoothed else self.error)
         return np.linalg.norm(umeyama(ours, self.p, with_scale=False).apply(ours) - self.p, axis=1)
 
     def between(self, begin_s, end_s):
@@ -64,8 +67,11 @@ def run(flight, carrier=True, base=False):
     settings = replace(settings, gnss=gnss)
     odometry = Odometry(flight.calibration, "flight", settings, flight.p_base if base else None)
     estimator, waiting, told, frame_s = odometry.estimator, [], [], []
+    smoother = estimator.history = Smoother(estimator.buffer)
     begun = time.process_time()
     for message in flight.messages:
+        if isinstance(message, GnssEpoch) and message.receiver == BASE and not base:
+            continue
         found = []
         if isinstance(message, TrackedFrame):
             waiting.append(message)
@@ -82,17 +88,23 @@ def run(flight, carrier=True, base=False):
             told += [(estimate, datum) for estimate in found if isinstance(estimate, Estimate)]
     tracker_s = sum(flight.tracker_s[m.t_ns] for m in flight.messages if isinstance(m, TrackedFrame))
     spent_s = time.process_time() - begun + tracker_s
-    return _against_the_truth(flight, told, np.array(frame_s), spent_s)
+    if estimator.window is not None:
+        smoother.ended(estimator.window)
+    path = {state.t_ns: state.T_world_body for state in between(smoother.path(), settings.imu)}
+    return _against_the_truth(flight, told, path, np.array(frame_s), spent_s)
 
 
-def _against_the_truth(flight, told, frame_s, cpu_s):
+def _against_the_truth(flight, told, path, frame_s, cpu_s):
     samples_s = [flight.seconds(m.t_ns) for m in flight.messages if isinstance(m, ImuSample)]
     t_s = np.array([flight.seconds(estimate.state.t_ns) for estimate, _ in told])
     truth = flight.trajectory.at(t_s)
-    error, turn_deg, nees = [], [], []
+    error, smoothed_error, turn_deg, nees = [], [], [], []
+    path_ns = np.array(sorted(path))
     for i, (estimate, datum) in enumerate(told):
         T = T_world_other(flight.datum, datum) @ estimate.state.T_world_body
         error.append(T.t - truth.p_world[i])
+        afterwards = path[path_ns[np.argmin(np.abs(path_ns - estimate.state.t_ns))]]
+        smoothed_error.append(T_world_other(flight.datum, datum).apply(afterwards.t) - truth.p_world[i])
         in_body = T.R.T @ error[-1]
         nees.append(in_body @ np.linalg.solve(estimate.covariance[3:, 3:], in_body))
         turn_deg.append(np.degrees(rotation_vector(T.R @ truth.R_world_body[i].T)))
@@ -100,6 +112,7 @@ def _against_the_truth(flight, told, frame_s, cpu_s):
         t_s,
         truth.p_world,
         np.array(error).reshape(-1, 3),
+        np.array(smoothed_error).reshape(-1, 3),
         np.array(turn_deg).reshape(-1, 3),
         np.array(nees),
         [estimate.mode for estimate, _ in told],
@@ -118,15 +131,17 @@ def _moving_s(flight, first_s):
 
 
 def accuracy(run):
-    """RMSE, mean and maximum m after alignment, RMSE m without, roll and pitch °, yaw °, NEES / 3, s until the world
-    was found, yaw ° then, CPU s for a second, CPU ms of a frame (median, 99 %), changes of mode."""
+    """RMSE, mean and maximum m after alignment, RMSE m of the smoothed path, RMSE m without alignment, roll and pitch,
+    yaw °, NEES / 3, s until the world was found, yaw ° then, CPU s for a second, CPU ms of a frame (median, 99 %),
+    changes of mode."""
     if not len(run.t_s):
-        return [np.nan] * 13
+        return [np.nan] * 14
     left = run.left()
     return [
         rms(left),
         left.mean(),
         left.max(),
+        rms(run.left(smoothed=True)),
         rms(np.linalg.norm(run.error, axis=1)),
         rms(run.turn_deg[:, :2]),
         rms(run.turn_deg[:, 2]),
