@@ -13,7 +13,7 @@ from air.sources.source import Sensed
 from air.sources.stills import StillPicker
 from common.geo import T_world_other
 from common.measurements import CameraFrame
-from common.messages import Datum, Keyframe, Photo, Pose
+from common.messages import Datum, EstimatorState, Keyframe, Photo, Pose
 from common.se3 import SE3
 
 
@@ -52,6 +52,8 @@ class Navigator:
             if isinstance(message, Pose | Keyframe) and not in_world:
                 continue
             out += self._settle(message) if isinstance(message, Datum) else [self._moved(message)]
+            if isinstance(message, EstimatorState):
+                self._picker.calibrate(self._camera, message.T_body_cam, message.time_offset_s)
             if isinstance(message, Datum | Pose | Jump):
                 out += self._pick(message)
         return out + self._pick(measurement)

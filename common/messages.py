@@ -120,7 +120,7 @@ class EstimatorState:
     NaN is what is unknown of the rest. `clock_s` is the receiver's clock minus GPST by satellite system (RINEX letter),
     and `clock_drift` how fast it grows, s/s; `lever_arm` (3,) m is the antenna in body. `code_rms_m`, `doppler_rms_mps`
     and `carrier_rms_m` are the root mean squares of the residuals of what is in use. One sigma is known of the
-    extrinsics: `rotation_sigma` (3,) rad and `translation_sigma` (3,) m of the camera, both in its axes,
+    extrinsics: `rotation_sigma` (3,) rad in the camera's axes, `translation_sigma` (3,) m in the body's,
     `time_offset_sigma_s`, `lever_arm_sigma` (3,) m.
     """
 

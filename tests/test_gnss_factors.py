@@ -11,8 +11,9 @@ from gnss_scene import DATUM
 
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
+from air.gnss.signals import LIGHT
 from air.odometry.gnss_biases import BiasNode, Kind, first_node, needed, next_node
-from air.odometry.gnss_factors import STATES, AntennaMotion, antenna_motion, linearise
+from air.odometry.gnss_factors import STATES, AntennaMotion, antenna_motion, linearise, misfit
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssNoise
 from air.odometry.mounting import ANTENNA, COLUMNS, MOUNTING
@@ -250,3 +251,15 @@ def test_a_satellite_that_was_away_for_long_begins_anew() -> None:
     assert soon.biases == first.biases
     without_carriers, _ = next_node(first, u, epoch.t_ns + 5 * SECOND_NS, {})
     assert without_carriers.biases.keys() == {bias for bias in first.biases if "/" not in bias[1]}
+
+
+def test_the_misfit_tells_the_clock_and_what_does_not_fit() -> None:
+    motion, biases = moved(np.zeros(STATES)), np.zeros(8)
+    epoch = epoch_at(motion.p_world, motion.v_world, 3000.0, 4.0, biases)
+    node, u = node_for(epoch, biases)
+    fits = misfit(epoch, motion, node, u, T_ECEF_WORLD)
+    assert max(fits.code, fits.carrier, fits.rate) < 1e-3
+    assert fits.clocks_s["G"] == pytest.approx(3000.0 / LIGHT, abs=1e-11)
+    assert fits.drift == pytest.approx(4.0 / LIGHT, abs=1e-12)
+    spoilt = replace(epoch, code=epoch.code + 2.0 * np.where(np.arange(8) % 2, 1.0, -1.0))
+    assert misfit(spoilt, motion, node, u, T_ECEF_WORLD).code == pytest.approx(2.0, abs=0.3)

@@ -162,17 +162,6 @@ class Estimator:
         self._propagate_from(window.state())
         return self._estimate(window, solution, note="the world has been found by GNSS")
 
-    def _fix(self, window: Window) -> SE3 | None:
-        """How whole cycles of carriers have moved the world, if they have."""
-        before = window.state().T_world_body
-        if not self.gnss.fix(window) or window.solve().failed:
-            return None
-        after = window.state().T_world_body
-        if np.linalg.norm(after.t - before.t) < JUMP:
-            return None
-        self.revision += 1
-        return level_between(before, after)
-
     def _begin_without_frames(self, epoch: CleanEpoch) -> Estimate | None:
         if epoch.t_ns - self._frame_ns < SILENT_S * 1e9:
             return None
@@ -269,14 +258,29 @@ class Estimator:
         solution = window.solve()
         if why := self._astray(window, solution, predicted):
             return self._repair(window, frame, predicted, why)
-        before, jump = window.state().T_world_body.t, self._fix(window)
+        fixed = self.gnss.fix(window) and not window.solve().failed
+        jump = self._jump(window, predicted, fixed)
         keyframe = window.state(-2) if window.slide() else None
         self._propagate_from(window.state())
         estimate = self._estimate(window, solution, keyframe, still)
         if jump is None:
             return estimate
-        moved = np.linalg.norm(jump.apply(before) - before)
-        return replace(estimate, jump=jump, note=f"carriers of whole cycles move the world by {moved:.2f} m")
+        moved = np.linalg.norm(jump.apply(predicted.T_world_body.t) - predicted.T_world_body.t)
+        return replace(estimate, jump=jump, note=f"GNSS moves the world by {moved:.2f} m")
+
+    def _jump(self, window: Window, predicted: InertialState, fixed: bool) -> SE3 | None:
+        """How GNSS has moved the world at this frame, where it has.
+
+        A camera that followed the ground to this frame does not err by so much: what moved is where the ground lies.
+        """
+        last, newest = window.frames[-2:]
+        followed = window.points.intersection(last.seen.ids.tolist()).intersection(newest.seen.ids.tolist())
+        by_codes = self.gnss.places_anew(newest.t_ns) and len(followed) >= self._settings.degradation.enough_points
+        moved = np.linalg.norm(window.state().T_world_body.t - predicted.T_world_body.t)
+        if moved < JUMP or not (fixed or by_codes):
+            return None
+        self.revision += 1
+        return level_between(predicted.T_world_body, window.state().T_world_body)
 
     def _estimate(
         self,

@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from air.gnss.gnss_time import SECOND_NS
+from air.odometry.gnss_factors import Misfit
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
 from air.odometry.gnss_settings import GnssSettings
 from air.odometry.gnss_start import GnssStart
@@ -23,6 +24,8 @@ WAITING = 50
 """Epochs that wait for the IMU; older ones are given up."""
 SIGMA_CYCLES = 0.05
 """Below it carriers of whole cycles place the aircraft, m; codes add nothing."""
+PLACING_S = 5.0
+"""Ranges of another kind have placed the aircraft within so long."""
 
 
 class GnssCoupling:
@@ -41,6 +44,8 @@ class GnssCoupling:
         self.datum: Datum | None = None
         self._used = (0, 0)
         self._anchor_sigma = 0.0
+        self._differential = False
+        self._began_ns: int | None = None
         self.why_not = "no epochs so far"
 
     # Measurements
@@ -104,6 +109,14 @@ class GnssCoupling:
         """Whether the place has just become known to whole cycles of a base station's carriers."""
         return self._companion is not None and self._companion.fix(window)
 
+    def places_anew(self, t_ns: int) -> bool:
+        """Whether ranges of another kind have begun lately to tell the place: differences to a base station."""
+        return self._began_ns is not None and t_ns - self._began_ns < PLACING_S * SECOND_NS
+
+    def misfit(self, window: Window) -> Misfit | None:
+        """How well the newest epoch fits; None where none is used."""
+        return None if self._companion is None else self._companion.misfit(window.values)
+
     def join(self, window: Window, datum: Datum) -> None:
         """Be the companion of a window whose world is ENU at a datum."""
         self.datum, self.why_not = datum, ""
@@ -120,6 +133,9 @@ class GnssCoupling:
         assert self._companion is not None
         if self._is_anchored(window, epoch.differential):
             epoch = epoch.without_code()
+        if epoch.differential and not self._differential:
+            self._began_ns = epoch.t_ns
+        self._differential = epoch.differential
         if self._companion.add(window, epoch):
             self._used = epoch.t_ns, int(np.sum(np.isfinite(epoch.code) | np.isfinite(epoch.rate)))
 

@@ -105,6 +105,69 @@ def linearise(
     metres. Rows whose biases the node does not have are left out. `line_carrier` (N, 3) are the directions, in world,
     along which carriers are held to see the antenna move.
     """
+    code, carrier, rate = _rows(epoch, motion, node, u, T_ecef_world, line_carrier)
+    ranging = _eliminated(
+        np.vstack([code.H, carrier.H]),
+        np.concatenate([code.left, carrier.left]),
+        np.concatenate([code.sigma, carrier.sigma]),
+        robust,
+    )
+    return total([ranging, _eliminated(rate.H, rate.left, rate.sigma, robust)])
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What is left of an epoch: root mean squares of codes m, carriers m and Dopplers m/s, NaN without any.
+
+    `clocks_s` is the receiver's clock s against the time of each system, by its letter, and `drift` how it grows, s/s:
+    unknown in differences to a base station.
+    """
+
+    code: float
+    carrier: float
+    rate: float
+    clocks_s: dict[str, float]
+    drift: float
+
+
+def misfit(
+    epoch: CleanEpoch,
+    motion: AntennaMotion,
+    node: BiasNode,
+    u: F64,
+    T_ecef_world: SE3,
+    line_carrier: F64 | None = None,
+) -> Misfit:
+    """How well an epoch fits; arguments as of `linearise`."""
+    code, carrier, rate = _rows(epoch, motion, node, u, T_ecef_world, line_carrier)
+    ranges = np.concatenate([code.left, carrier.left])
+    clock, drift = (float(np.median(left)) if len(left) else np.nan for left in (ranges, rate.left))
+    sizes = _rms(code.left - clock), _rms(carrier.left - clock), _rms(rate.left - drift)
+    if epoch.differential:
+        return Misfit(*sizes, {}, np.nan)
+    delays = {name: float(u[column]) for (kind, name), column in node.biases.items() if kind is Kind.SYSTEM}
+    clocks_s = {name: (clock + delays.get(name, 0.0)) / LIGHT for name in set(epoch.systems) if np.isfinite(clock)}
+    return Misfit(*sizes, clocks_s, drift / LIGHT)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows (M, width) of one kind of measurement, what is `left` of them (M,), the clock in it, and sigmas (M,)."""
+
+    H: F64
+    left: F64
+    sigma: F64
+
+
+def _rows(
+    epoch: CleanEpoch,
+    motion: AntennaMotion,
+    node: BiasNode,
+    u: F64,
+    T_ecef_world: SE3,
+    line_carrier: F64 | None,
+) -> tuple[_Rows, _Rows, _Rows]:
+    """Codes, carriers and Dopplers."""
     p = T_ecef_world.apply(motion.p_world)
     v = T_ecef_world.R @ motion.v_world
     distance, line = geometric_range(epoch.p_satellite, p)
@@ -129,23 +192,23 @@ def linearise(
     rate = np.flatnonzero(np.isfinite(epoch.rate) & (drift >= 0) & ~np.isfinite(epoch.carrier))
     values, since_s = np.concatenate([np.zeros(STATES), u]), (epoch.t_ns - node.t_ns) / SECOND_NS
 
-    def rows(which: I64, H: F64, measured: F64, expected: F64, *columns: tuple[I64, float]) -> tuple[F64, F64]:
+    def rows(which: I64, H: F64, measured: F64, expected: F64, sigma: F64, *columns: tuple[I64, float]) -> _Rows:
         H = H[which].copy()
         for column, factor in columns:
             found = column[which] >= 0
             H[np.flatnonzero(found), STATES + column[which][found]] = factor
-        return H, measured[which] - expected[which] - H[:, STATES:] @ values[STATES:]
+        return _Rows(H, measured[which] - expected[which] - H[:, STATES:] @ values[STATES:], sigma[which])
 
-    H_code, r_code = rows(code, by_position, epoch.code, distance, (multipath, 1.0), (slow, 1.0), (systems, 1.0))
-    H_carrier, r_carrier = rows(carrier, by_way, epoch.carrier, distance, (ambiguity, 1.0), (drift, since_s))
-    H_rate, r_rate = rows(rate, by_velocity, epoch.rate, _range_rates(epoch, p, v, line), (drift, 1.0))
-    ranging = _eliminated(
-        np.vstack([H_code, H_carrier]),
-        np.concatenate([r_code, r_carrier]),
-        np.concatenate([epoch.sigma_code[code], epoch.sigma_carrier[carrier]]),
-        robust,
+    spoilt = (multipath, 1.0), (slow, 1.0), (systems, 1.0)
+    return (
+        rows(code, by_position, epoch.code, distance, epoch.sigma_code, *spoilt),
+        rows(carrier, by_way, epoch.carrier, distance, epoch.sigma_carrier, (ambiguity, 1.0), (drift, since_s)),
+        rows(rate, by_velocity, epoch.rate, _range_rates(epoch, p, v, line), epoch.sigma_rate, (drift, 1.0)),
     )
-    return total([ranging, _eliminated(H_rate, r_rate, epoch.sigma_rate[rate], robust)])
+
+
+def _rms(values: F64) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
 def total(parts: Sequence[Linearised]) -> Linearised:

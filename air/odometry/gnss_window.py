@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import B, V, X
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
 from air.odometry.gnss_biases import BiasNode, first_node, needed, next_node
-from air.odometry.gnss_factors import antenna_motion, linearise, total
+from air.odometry.gnss_factors import AntennaMotion, Misfit, antenna_motion, linearise, misfit, total
 from air.odometry.gnss_fixing import fix
 from air.odometry.gnss_preprocessing import CleanEpoch
 from air.odometry.gnss_settings import GnssSettings
@@ -188,17 +188,29 @@ class GnssWindow:
         line = None if epoch.differential else self._line_carrier(epoch, p_world)
         return _Taken(epoch, measured, omega, line)
 
-    def _linearised(self, values: gtsam.Values, stretch: _Stretch, taken: Sequence[_Taken]) -> Quadratic:
-        k, node = stretch.k, stretch.node
+    def misfit(self, values: gtsam.Values) -> Misfit | None:
+        """How well the newest epoch fits; None without one."""
+        if not self._stretches:
+            return None
+        stretch = self._stretches[-1]
+        one, node = stretch.taken[-1], stretch.node
+        motion = self._motion(values, stretch.k, one)
+        return misfit(one.epoch, motion, node, values.atVector(node.key), self._T_ecef_world, one.line_carrier)
+
+    def _motion(self, values: gtsam.Values, k: int, one: _Taken) -> AntennaMotion:
         pose, velocity, bias = values.atPose3(X(k)), values.atVector(V(k)), values.atConstantBias(B(k))
-        u, m = values.atVector(node.key), values.atVector(MOUNTING)
+        lever = self._lever + values.atVector(MOUNTING)[ANTENNA]
+        return antenna_motion(pose, velocity, bias, one.measured, lever, one.omega)
+
+    def _linearised(self, values: gtsam.Values, stretch: _Stretch, taken: Sequence[_Taken]) -> Quadratic:
+        k, node, u = stretch.k, stretch.node, values.atVector(stretch.node.key)
         robust = self._settings.noise.robust if stretch.weighted else np.inf
-        lever, parts = self._lever + m[ANTENNA], []
-        for one in taken:
-            motion = antenna_motion(pose, velocity, bias, one.measured, lever, one.omega)
-            parts.append(linearise(one.epoch, motion, node, u, self._T_ecef_world, robust, one.line_carrier))
+        parts = [
+            linearise(one.epoch, self._motion(values, k, one), node, u, self._T_ecef_world, robust, one.line_carrier)
+            for one in taken
+        ]
         whole = total(parts)
-        point = {X(k): pose, V(k): velocity, B(k): bias.vector(), MOUNTING: m, node.key: u}
+        point = {key: variable(values, key) for key in (X(k), V(k), B(k), MOUNTING, node.key)}
         return Quadratic(point, whole.G, whole.g, whole.f)
 
     def _is_stale(self, values: gtsam.Values, stretch: _Stretch) -> bool:

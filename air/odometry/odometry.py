@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from air.alignment.prepare import thumbnail
 from air.jump import Jump
 from air.odometry.estimator import Estimate, Estimator
 from air.odometry.initial import KnownSpeed, Refusal
+from air.odometry.mounting import ANTENNA, DELAY, SHIFT, TURN
 from air.odometry.preintegration import InertialState
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import Tracker
@@ -221,26 +223,43 @@ class Odometry:
             revision=self.estimator.revision,
             t_ns=state.t_ns,
             name=f"frame-{state.t_ns}",
-            T_world_cam=state.T_world_body @ self._T_body_cam,
+            T_world_cam=state.T_world_body @ self.estimator.mounted.now.T_body_cam,
             camera=camera,
             sigma=self._sigma,
             thumbnail=thumbnail(_rgb(images[0])) if images else b"",
         )
 
     def _state(self, estimate: Estimate) -> EstimatorState:
-        state = estimate.state
-        return EstimatorState(
+        state, mounted, window = estimate.state, self.estimator.mounted, self.estimator.window
+        sigma = np.sqrt(np.maximum(np.diag(mounted.covariance), 0.0))
+        told = EstimatorState(
             flight=self._flight,
             t_ns=state.t_ns,
             revision=estimate.revision,
             mode=estimate.mode,
             accel_bias=state.accel_bias,
             gyro_bias=state.gyro_bias,
-            T_body_cam=self._T_body_cam,
-            time_offset_s=self._time_offset_s,
+            T_body_cam=mounted.now.T_body_cam,
+            time_offset_s=self._time_offset_s + mounted.now.delay_s,
             points=estimate.solution.points,
             satellites=self.estimator.gnss.satellites(state.t_ns),
             reprojection_rms_px=estimate.solution.rms_px,
+            lever_arm=mounted.now.p_body_antenna,
+            rotation_sigma=sigma[TURN],
+            translation_sigma=sigma[SHIFT],
+            time_offset_sigma_s=float(sigma[DELAY][0]),
+            lever_arm_sigma=sigma[ANTENNA],
+        )
+        misfit = None if window is None else self.estimator.gnss.misfit(window)
+        if misfit is None:
+            return told
+        return replace(
+            told,
+            clock_s=misfit.clocks_s,
+            clock_drift=misfit.drift,
+            code_rms_m=misfit.code,
+            carrier_rms_m=misfit.carrier,
+            doppler_rms_mps=misfit.rate,
         )
 
 

@@ -56,7 +56,7 @@ class StillPicker:
     """Chooses the frames of one camera that make photos (core: measurements and poses in, photos out)."""
 
     def __init__(self, cameras: Mapping[str, Calibration]) -> None:
-        self._cameras = cameras
+        self._cameras = dict(cameras)
         self._camera: str | None = None
         self._solution: ReceiverSolution | None = None
         self._lowest = np.inf
@@ -93,6 +93,11 @@ class StillPicker:
             case CameraFrame():
                 return self._take(measurement)
         return None
+
+    def calibrate(self, camera: str, T_body_cam: SE3, time_offset_s: float) -> None:
+        """Use what the flight has told about how a camera sits, and the clock of its frames."""
+        if (calibration := self._cameras.get(camera)) is not None:
+            self._cameras[camera] = replace(calibration, T_body_cam=T_body_cam, time_offset_s=time_offset_s)
 
     def _jump(self, jump: Jump) -> None:
         """Bring the latest poses into the new world, so that those to come can follow them."""
