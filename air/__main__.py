@@ -68,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     odometry.add_argument("source", metavar="SOURCE", help="with IMU samples and frames or raw GNSS: F.mcap, euroc:DIR")
     odometry.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     odometry.add_argument("--calibration", type=Path, metavar="F", help="of the camera, where the source has none")
+    odometry.add_argument("--smooth", action="store_true", help="also the path as the whole flight tells it afterwards")
     odometry.set_defaults(run=_odometry)
 
     record = commands.add_parser("record", help="record everything on the bus into a file until it is stopped")
@@ -178,7 +179,7 @@ def _odometry(args: argparse.Namespace) -> int:
     from air.trajectory import find_trajectory, in_words
 
     settings = load(args.config, AirConfig).odometry
-    report = find_trajectory(args.source, args.out, args.calibration, settings, args.quiet)
+    report = find_trajectory(args.source, args.out, args.calibration, settings, args.quiet, args.smooth)
     for problem in report.problems:
         print(f"{problem['name']}: {problem['text']}", file=sys.stderr)
     for line in in_words(report):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from itertools import tee
 from pathlib import Path
 
 from tqdm import tqdm
@@ -11,6 +12,7 @@ from tqdm import tqdm
 from air.navigation import mounted, with_lever_arm
 from air.odometry.odometry import Odometry
 from air.odometry.settings import OdometrySettings
+from air.odometry.smoothing import Smoother
 from air.odometry_report import OdometryReport, Told
 from air.report import Stopwatch, peak_memory
 from air.sensors.calibration import read_calibration
@@ -21,6 +23,8 @@ from common.export.datum import write_datum
 from common.export.trajectory import write_tum
 from common.measurements import CameraFrame, GnssEpoch
 from common.messages import Keyframe, Pose
+
+SMOOTHED = "smoothed.tum"
 
 
 @dataclass(frozen=True)
@@ -38,12 +42,13 @@ class TrajectoryReport:
 
 
 def find_trajectory(
-    url: str, out: Path, calibration: Path | None, settings: OdometrySettings, quiet: bool
+    url: str, out: Path, calibration: Path | None, settings: OdometrySettings, quiet: bool, smooth: bool = False
 ) -> TrajectoryReport:
     """The report of a source's trajectory, after files have been written into `out`.
 
-    These are `trajectory.tum` (body, at the rate of the IMU), `report.json`, with a camera `keyframes.tum`, and where
-    GNSS has told where the world lies, `datum.json`. Without a camera GNSS and IMU alone tell the trajectory.
+    These are `trajectory.tum` (body, at the rate of the IMU, as it was told at its time), `report.json`, with `smooth`
+    also `smoothed.tum`, the same as all measurements of the flight tell it afterwards, with a camera `keyframes.tum`,
+    and where GNSS has told where the world lies, `datum.json`. Without a camera GNSS and IMU alone tell the trajectory.
 
     Raises SourceError, CalibrationError where the camera is not known, and ExportError where nothing can be written.
     """
@@ -52,6 +57,8 @@ def find_trajectory(
     given = None if calibration is None else ("", read_calibration(calibration))
     camera, mounting = given or mounted(known) or ("", None)
     odometry = Odometry(mounting, "flight", with_lever_arm(settings, known), known.p_base_ecef, watch.stage)
+    smoother = Smoother(odometry.estimator.buffer)
+    odometry.estimator.history = smoother if smooth else None
     frames, epochs = 0, 0
     for message in tqdm(source, unit=" items", leave=False, disable=True if quiet else None):
         if isinstance(message, CameraFrame):
@@ -78,7 +85,9 @@ def find_trajectory(
         stages_s=watch.stages,
         peak_memory_bytes=peak_memory(),
     )
-    _write(out, told, report)
+    if smooth and odometry.estimator.window is not None:
+        smoother.ended(odometry.estimator.window)
+    _write(out, told, report, smoother if smooth else None)
     return report
 
 
@@ -94,12 +103,15 @@ def _unknown(source: Source, camera: str) -> CalibrationError:
     )
 
 
-def _write(out: Path, told: Told, report: TrajectoryReport) -> None:
+def _write(out: Path, told: Told, report: TrajectoryReport, smoother: Smoother | None) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_tum(out / "trajectory.tum", told.poses.t_ns, told.poses)
         if report.frames:
             write_tum(out / "keyframes.tum", told.keyframes.t_ns, told.keyframes)
+        if smoother is not None:
+            one, same = tee(smoother.states())
+            write_tum(out / SMOOTHED, (state.t_ns for state in one), (state.T_world_body for state in same))
         if told.datum is not None:
             write_datum(out / "datum.json", told.datum)
         (out / "report.json").write_text(json.dumps(asdict(report), indent=2) + "\n")

@@ -122,7 +122,7 @@ def test_a_camera_that_sits_nowhere_is_refused() -> None:
 
 
 def test_a_drive_without_a_camera_is_found_by_gnss_and_imu(real_data: Callable[[str], Path], tmp_path: Path) -> None:
-    assert main(["odometry", f"comma2k19:{real_data('comma2k19')}", "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["odometry", f"comma2k19:{real_data('comma2k19')}", "--out", str(tmp_path), "--smooth", "--quiet"]) == 0
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["camera"], report["frames"], report["odometry"]["keyframes"]) == ("", 0, 0)
     assert report["odometry"]["world_found_s"] < 20.0
@@ -130,6 +130,11 @@ def test_a_drive_without_a_camera_is_found_by_gnss_and_imu(real_data: Callable[[
     assert len(read_tum(tmp_path / "trajectory.tum").t_ns) == report["odometry"]["poses"] > 4000
     assert read_datum(tmp_path / "datum.json").latitude_deg == pytest.approx(37.7, abs=0.5)
     assert not (tmp_path / "keyframes.tum").exists()
+    told, smoothed = (read_tum(tmp_path / f"{name}.tum") for name in ("trajectory", "smoothed"))
+    assert (np.diff(smoothed.t_ns) > 0).all()
+    assert smoothed.t_ns[-1] == pytest.approx(told.t_ns[-1], abs=1_100_000_000)
+    steps = [np.linalg.norm(np.diff(path.positions[-2000:], axis=0), axis=1) for path in (told, smoothed)]
+    assert steps[1].max() < 0.5 < 1.05 * steps[0].max() + 0.5  # without the steps of what was told on the way
 
 
 def test_without_a_calibration_frames_are_refused() -> None:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 from odometry_scene import Scene
-from test_odometry_window import IMU, flown
+from test_odometry_window import flown
 
 from air.odometry.preintegration import ImuBuffer, from_pose3
 from air.odometry.quadratic import Conditional, NormalEquations
-from air.odometry.smoothing import Smoother, between
+from air.odometry.smoothing import Smoother
 from air.odometry.window import Window
 from common.arrays import F64
 from common.se3 import SE3
@@ -110,8 +110,7 @@ def test_between_keyframes_the_path_follows_the_imu_and_meets_each_of_them() -> 
 
     window, scene, _, _ = flown(3, 8.0, prepared=remember)
     smoothers[0].ended(window)
-    path = smoothers[0].path()
-    states = list(between(path, IMU))
+    path, states = smoothers[0].path(), list(smoothers[0].states())
     assert (np.diff([s.t_ns for s in states]) > 0).all()
     assert np.diff([s.t_ns for s in states]).max() <= 5_100_000
     at = {s.t_ns: s.T_world_body for s in states}

@@ -17,7 +17,6 @@ from gtsam.symbol_shorthand import B, V, X
 
 from air.odometry.preintegration import ImuBuffer, ImuPieces, InertialState, Preintegrator, Propagation, from_pose3
 from air.odometry.quadratic import Conditional, Variable, carried, moved, retracted, variable
-from air.odometry.settings import ImuSettings
 from air.odometry.window import Window
 from common.arrays import F64
 from common.se3 import SE3, level_between, rotation_vector, rotation_vector_to_matrix
@@ -62,6 +61,7 @@ class Smoother:
     """The history of a flight's windows. Half a megabyte for each second of flight: for recordings, not on board."""
 
     imu: ImuBuffer
+    _integrator: Preintegrator | None = None
     _records: list[_Left | _Moving | _Ended] = field(default_factory=list)
 
     def left(self, window: Window, conditional: Conditional) -> None:
@@ -75,6 +75,7 @@ class Smoother:
 
     def ended(self, window: Window) -> None:
         """What the window holds stays as it is."""
+        self._integrator = window.preintegrator
         known = {key: variable(window.values, key) for key in window.values.keys()}  # noqa: SIM118
         ends_ns = [*(frame.t_ns for frame in window.frames[1:]), window.frames[-1].t_ns]
         frames = [
@@ -102,6 +103,26 @@ class Smoother:
             out += [Smoothed(_state(known, k, t_ns, T_last_world), felt) for k, t_ns, felt in found]
         return out[::-1]
 
+    def states(self) -> Iterator[InertialState]:
+        """The states at the rate of the IMU: carried on from each keyframe, and bent to end at the next."""
+        path, integrator = self.path(), self._integrator
+        if integrator is None:
+            return
+        for here, after in pairwise(path):
+            states = list(_carried_on(here, integrator))
+            yield from _bent(states[:-1], states[-1], after.state)
+        yield path[-1].state
+
+
+def _carried_on(here: Smoothed, integrator: Preintegrator) -> Iterator[InertialState]:
+    """A keyframe, and where the IMU leads from it piece by piece."""
+    propagation, felt = Propagation(integrator, here.state), here.felt
+    yield here.state
+    for i in range(len(felt.dt_s)):
+        one = slice(i, i + 1)
+        propagation.advance(ImuPieces(felt.dt_s[one], felt.accel[one], felt.gyro[one], felt.doubtful[one]))
+        yield propagation.state
+
 
 def _given(conditional: Conditional, known: Mapping[int, Variable]) -> dict[int, Variable]:
     """The variables that left, given those that stayed."""
@@ -118,20 +139,6 @@ def _state(known: Mapping[int, Variable], k: int, t_ns: int, T_last_world: SE3) 
     biases = known[B(k)]
     pose = T_last_world @ from_pose3(known[X(k)])
     return InertialState(t_ns, pose, T_last_world.R @ known[V(k)], biases[:3], biases[3:])
-
-
-def between(path: list[Smoothed], settings: ImuSettings) -> Iterator[InertialState]:
-    """The states at every piece of what the IMU felt: carried on from each keyframe, and bent to end at the next."""
-    integrator = Preintegrator(settings)
-    for here, after in pairwise(path):
-        propagation, states, felt = Propagation(integrator, here.state), [here.state], here.felt
-        for i in range(len(felt.dt_s)):
-            one = slice(i, i + 1)
-            propagation.advance(ImuPieces(felt.dt_s[one], felt.accel[one], felt.gyro[one], felt.doubtful[one]))
-            states.append(propagation.state)
-        yield from _bent(states[:-1], states[-1], after.state)
-    if path:
-        yield path[-1].state
 
 
 def _bent(states: list[InertialState], end: InertialState, wanted: InertialState) -> Iterator[InertialState]:

@@ -8,7 +8,7 @@ import numpy as np
 from air.odometry.estimator import Estimate
 from air.odometry.odometry import BASE, Odometry
 from air.odometry.settings import OdometrySettings
-from air.odometry.smoothing import Smoother, between
+from air.odometry.smoothing import Smoother
 from air.odometry.tracker import TrackedFrame
 from common.geo import T_world_other
 from common.measurements import GnssEpoch, ImuSample
@@ -90,7 +90,7 @@ def run(flight, carrier=True, base=False):
     spent_s = time.process_time() - begun + tracker_s
     if estimator.window is not None:
         smoother.ended(estimator.window)
-    path = {state.t_ns: state.T_world_body for state in between(smoother.path(), settings.imu)}
+    path = {state.t_ns: state.T_world_body for state in smoother.states()}
     return _against_the_truth(flight, told, path, np.array(frame_s), spent_s)
 
 
