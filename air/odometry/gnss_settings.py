@@ -38,12 +38,13 @@ class GnssNoise:
     """One sigma of each error, m unless said otherwise, at 45 dBHz and in the zenith, where that matters.
 
     `code`, `carrier`, `rate` (m/s) are white; `code` and `carrier` are larger than their noise, as the loops of
-    receivers and, of carriers, millimetres of multipath make it alike over many epochs. Of each satellite: `multipath` of the code, correlated over
-    `multipath_s`, as its elevation lets it grow; `orbit` with the satellite's clock, of GPS, and `ionosphere` and
-    `troposphere` beyond the models, all together over `slow_s`. How fast these change, Doppler and carrier see: by
-    `orbit_drift` m/s, and by `drift` m/s where the ionosphere is in it, over `drift_s`; a carrier's ambiguity wanders
-    by `ambiguity_walk` m/√s besides, and the delay between two systems by `system_walk` m/√s. Differences to a base
-    station keep the share `differential` of what is slow. Residuals beyond `robust` sigmas lose weight.
+    receivers and, of carriers, millimetres of multipath make it alike over many epochs. Of each satellite: `multipath`
+    of the code, correlated over `multipath_s`, as its elevation lets it grow; `orbit` with the satellite's clock, of
+    GPS, and `ionosphere` and `troposphere` beyond the models, all together over `slow_s`. How fast these change,
+    Doppler and carrier see: by `orbit_drift` m/s, and by `drift` m/s where the ionosphere is in it, over `drift_s`; a
+    carrier's ambiguity wanders by `ambiguity_walk` m/√s besides, and the delay between two systems by `system_walk`
+    m/√s. Differences to a base station keep the share `differential` of what is slow. Residuals beyond `robust` sigmas
+    lose weight.
     """
 
     code: Sigma = 0.4
