@@ -14,9 +14,10 @@ from gnss_flight import DATUM, START_NS, GnssFlight, errors, estimates, flight
 from air.gnss.gnss_time import SECOND_NS, to_week
 from air.gnss.positioning import PointPosition
 from air.gnss.settings import PositioningSettings
-from air.odometry.estimator import Estimate, Estimator
+from air.odometry.estimator import Estimate, Estimator, blind_frame
 from air.odometry.gnss_attitude import InitialAttitude, MeasuredVelocity, find_attitude
 from air.odometry.gnss_settings import GnssNoise, GnssSelection, GnssSettings
+from air.odometry.gnss_window import _age
 from air.odometry.preintegration import ImuBuffer
 from air.odometry.settings import ImuSettings, OdometrySettings
 from air.positions import find_positions
@@ -62,6 +63,28 @@ def test_poses_follow_the_truth_within_their_sigma(flown: GnssFlight, carrier: b
         assert pose.state.v_world @ T.R.T == pytest.approx(v_world, abs=0.1)
         turn = gtsam.Rot3.Logmap(gtsam.Rot3(R_world_body.T @ T.R @ pose.state.T_world_body.R))
         assert np.degrees(np.linalg.norm(turn)) < 2.0
+
+
+def test_a_camera_that_shows_nothing_does_not_keep_it_from_beginning(flown: GnssFlight) -> None:
+    times_ns = [m.t_ns for m in flown.messages if isinstance(m, ImuSample)]
+    frames = [(t_ns, blind_frame(t_ns)) for t_ns in times_ns[::20]]
+    stamped = [(m.t_ns, m) for m in flown.messages if isinstance(m, ImuSample | GnssEpoch)]
+    others = [m for m in flown.messages if not isinstance(m, ImuSample | GnssEpoch)]
+    messages = [*others, *(m for _, m in sorted([*stamped, *frames], key=lambda item: item[0]))]
+    (poses, datum), (usual, _) = estimate(flown, messages=messages), estimate(flown)
+    assert poses[0].state.t_ns - usual[0].state.t_ns < 3 * SECOND_NS
+    assert len(poses) > 5 * len(usual)  # one at each frame
+    off, _ = errors(flown, poses, datum)
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 4.0
+
+
+def test_carriers_begin_anew_one_after_the_other(flown: GnssFlight) -> None:
+    arcs = [f"{system}{number:02d}/7" for system in "GREC" for number in range(1, 33)]
+    ages = np.array([[_age(arc, t * SECOND_NS) for arc in arcs] for t in range(0, 1300, 5)])
+    renewed = np.diff(ages, axis=0)
+    assert set(renewed.ravel().tolist()) == {0, 1}
+    assert renewed.sum(axis=1).max() <= 8
+    assert (ages[-1] - ages[0] >= 2).all()
 
 
 def test_the_same_measurements_give_the_same_poses(flown: GnssFlight) -> None:

@@ -20,7 +20,7 @@ class Companion(Protocol):
         """What it knows about the frames that the window holds now."""
         ...
 
-    def leaving(self, window: Window, k: int) -> tuple[list[int], list[Quadratic]]:
+    def leaving(self, k: int) -> tuple[list[int], list[Quadratic]]:
         """Own keys that leave with frame k, and all that it knows about them and that frame."""
         ...
 

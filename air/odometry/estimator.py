@@ -84,7 +84,7 @@ class Estimator:
         self._initialization = self._new_initialization()
         self._monitor = Monitor(self._settings.degradation)
         self._propagation: Propagation | None = None
-        self._frame_ns = 0
+        self._frame_ns = self._sighted_ns = 0
         self._recent: list[TrackedFrame] = []
         self._repaired_ns = -(10**18)
         self.revision = 0
@@ -163,7 +163,7 @@ class Estimator:
         return self._estimate(window, solution, note="the world has been found by GNSS")
 
     def _begin_without_frames(self, epoch: CleanEpoch) -> Estimate | None:
-        if epoch.t_ns - self._frame_ns < SILENT_S * 1e9:
+        if epoch.t_ns - self._sighted_ns < SILENT_S * 1e9:
             return None
         found = self.gnss.start.add(epoch, self.buffer, self._settings.imu)
         if isinstance(found, str):
@@ -174,7 +174,7 @@ class Estimator:
         window.begin(found.state, found.covariance, Seen.nothing())
         self.gnss.join(window, self.gnss.start.datum)
         self._window, self._monitor = window, Monitor(self._settings.degradation, visual=False, gnss=True)
-        self._frame_ns = epoch.t_ns
+        self._frame_ns = max(self._frame_ns, epoch.t_ns)
         self.revision += 1
         self._propagate_from(found.state)
         return self._estimate(window, Solution(0.0, 0, 0), note="begins in motion, without a camera")
@@ -203,6 +203,8 @@ class Estimator:
         if frame.t_ns <= self._frame_ns:
             return Refusal("a frame is older than the last one")
         self._frame_ns = frame.t_ns
+        if not frame.blind:
+            self._sighted_ns = frame.t_ns
         self._remember(frame)
         return self._begin(frame) if self._window is None else self._continue(self._window, frame)
 

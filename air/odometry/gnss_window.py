@@ -36,6 +36,8 @@ TRY_S = 0.5
 """Between two tries to fix whole cycles."""
 LINE_S, MOST_LINES = 600.0, 500
 """A carrier begins anew after so long: the direction of its satellite has changed too much."""
+GOLDEN = 0.6180339887
+"""Its multiples lie evenly between whole numbers."""
 MOSTLY = 0.7
 """Share of an epoch's biases that a node must have, or a new one begins at once."""
 
@@ -127,7 +129,7 @@ class GnssWindow:
             self._adjusted = self._nodes[-1].index
         return [*self._links, *(s.known for s in self._stretches if s.known is not None)]
 
-    def leaving(self, window: Window, k: int) -> tuple[list[int], list[Quadratic]]:
+    def leaving(self, k: int) -> tuple[list[int], list[Quadratic]]:
         """The nodes that no later keyframe needs, and all that is known about them and keyframe k."""
         mine = [s for s in self._stretches if s.k == k]
         self._stretches = [s for s in self._stretches if s.k != k]
@@ -166,8 +168,7 @@ class GnssWindow:
 
     def _renewed(self, epoch: CleanEpoch) -> CleanEpoch:
         """The epoch with its carriers named anew when the directions in which they were first seen are old."""
-        age = epoch.t_ns // round(LINE_S * SECOND_NS)
-        return replace(epoch, arcs=tuple(arc and f"{arc}@{age}" for arc in epoch.arcs))
+        return replace(epoch, arcs=tuple(arc and f"{arc}@{_age(arc, epoch.t_ns)}" for arc in epoch.arcs))
 
     def _line_carrier(self, epoch: CleanEpoch, p_world: F64) -> F64:
         """The direction (N, 3) in world in which each carrier was first seen."""
@@ -226,6 +227,12 @@ def _before(frames: Sequence[Frame], t_ns: int) -> Frame | None:
     """The last frame before a time that is sure to stay: the newest one may be dropped yet."""
     sure: Iterable[Frame] = frames[:-1] if len(frames) > 1 else frames
     return next((frame for frame in reversed(list(sure)) if frame.t_ns <= t_ns), None)
+
+
+def _age(arc: str, t_ns: int) -> int:
+    """How often a carrier has begun anew because its direction was old; each satellite at another time."""
+    share = int(arc[1:3]) * GOLDEN % 1.0
+    return int(t_ns / (LINE_S * SECOND_NS) + share)
 
 
 def _sum(a: Quadratic, b: Quadratic) -> Quadratic:

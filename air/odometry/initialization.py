@@ -12,6 +12,9 @@ from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import TrackedFrame
 from common.se3 import SE3
 
+BLIND_S = 30.0
+"""While a camera shows nothing, samples are kept for so long: GNSS may find the attitude from them."""
+
 
 class Initialization:
     """Collects frames and tries, after each, to begin at rest, and every few frames to begin in motion."""
@@ -31,7 +34,8 @@ class Initialization:
         s = self.settings.initialization
         begin_ns = frame.t_ns - round(max(s.span_s, s.still_s + 0.5) * 1e9)
         self._frames = [f for f in self._frames if f.t_ns >= begin_ns] + [frame]
-        self._buffer.forget(self._frames[0].t_ns)
+        sighted = any(not f.blind for f in self._frames)
+        self._buffer.forget(self._frames[0].t_ns if sighted else frame.t_ns - round(BLIND_S * 1e9))
         at_rest = self._at_rest(frame.t_ns)
         if isinstance(at_rest, Initial) or frame.t_ns - self._tried_ns < round(s.try_every_s * 1e9):
             return at_rest

@@ -351,7 +351,7 @@ class Window:
         assert self._prior is not None
         known = [self._prior]
         if self.companion is not None:
-            others, more = self.companion.leaving(self, oldest.k)
+            others, more = self.companion.leaving(oldest.k)
             leaving, known = [*others, *leaving], [*known, *more]
         seen = self._leaving(oldest, gone, kept).linearised(self.values)
         equations = equations_of(self._inertial(self.frames[:2]), seen, known, self.values)
