@@ -150,3 +150,26 @@ def test_a_base_station_places_the_aircraft_to_centimetres() -> None:
     late = out.t_s > out.t_s[0] + 5.0
     assert late.sum() > 20
     assert np.linalg.norm(out.off[late], axis=1).max() < 0.08
+
+
+def test_a_base_station_that_begins_in_flight_moves_the_world_in_told_jumps() -> None:
+    """So whoever keeps places, as the map does, can move them along."""
+    truth = flight(SEED, 30.0, IN_THE_AIR, base=GnssOptions.base())
+    messages = with_frames(truth, Scene(SEED, 30.0, IN_THE_AIR, ImuOptions()))
+
+    def silent(t: float, m: object) -> object | None:
+        return None if isinstance(m, GnssEpoch) and m.receiver == "base" and t < 18.0 else m
+
+    out = Outcome((truth, messages), silent, base=BASE_ECEF)
+    before, after = out.off[out.t_s < 17.9][-1], out.off[out.t_s > 24.0]
+    assert np.linalg.norm(before) > 0.3
+    assert np.linalg.norm(after, axis=1).max() < 0.08
+    jumps = [one for one in out.estimates if one.jump is not None]
+    assert 1 <= len(jumps) <= 4
+    assert out.estimator.revision == 1 + len(jumps)
+    steps = np.diff(out.off, axis=0)
+    for step, one in zip(steps, out.estimates[1:], strict=True):
+        if one.jump is not None:
+            p = one.state.T_world_body.t
+            step = step - (p - one.jump.inverse().apply(p))
+        assert np.linalg.norm(step) < 0.15
