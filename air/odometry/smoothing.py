@@ -58,7 +58,7 @@ class Smoothed:
 
 @dataclass(eq=False)
 class Smoother:
-    """The history of a flight's windows. Half a megabyte for each second of flight: for recordings, not on board."""
+    """The history of a flight's windows. Some 0.2 MB for each second of flight: for recordings, not on board."""
 
     imu: ImuBuffer
     _integrator: Preintegrator | None = None
