@@ -94,22 +94,10 @@ class Sightings:
         size = np.linalg.norm(seen.residual, axis=1) / self.lens.sigma
         weight = np.where(seen.before, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0) / self.lens.sigma**2
         by_pose, by_mounting, by_point = self._derivatives(seen)
-        F, P, width = len(self.frames), len(self.points), 6 * len(self.frames) + COLUMNS
-        G, g = np.zeros((width, width)), np.zeros(width)
-        fixed = slice(6 * F, width)
-        for f in range(F):
-            mine = self.frame == f
-            own, W, r = slice(6 * f, 6 * f + 6), weight[mine, None, None], seen.residual[mine].ravel()
-            J, J_mounting = by_pose[mine].reshape(-1, 6), by_mounting[mine].reshape(-1, COLUMNS)
-            WJ, WJ_mounting = (W * by_pose[mine]).reshape(-1, 6), (W * by_mounting[mine]).reshape(-1, COLUMNS)
-            G[own, own], G[own, fixed] = WJ.T @ J, WJ.T @ J_mounting
-            G[fixed, own] = G[own, fixed].T
-            G[fixed, fixed] += WJ_mounting.T @ J_mounting
-            g[own] = WJ.T @ r
-            g[fixed] += WJ_mounting.T @ r
+        G, g = self._of_frames(weight, seen.residual, by_pose, by_mounting)
         H, h, E = self._of_points(weight, seen.residual, by_pose, by_mounting, by_point)
         H += self.weak[:, None, None] * np.eye(3)
-        free, kept = slice(0, self.free), slice(self.free, P)
+        free, kept, width = slice(0, self.free), slice(self.free, None), len(g)
         way = np.linalg.solve(H[free], np.concatenate([E[free], h[free, :, None]], axis=2))
         flat = E[free].reshape(-1, width)
         G -= flat.T @ way[:, :, :-1].reshape(-1, width)
@@ -117,6 +105,23 @@ class Sightings:
         G, g = _with_points(G, g, H[kept], h[kept], E[kept])
         keys = [*self.frames, MOUNTING, *self.points[kept]]
         return LinearSightings(keys, G, g, self.points[free], self.frames, way)
+
+    def _of_frames(self, weight: F64, residual: F64, by_pose: F64, by_mounting: F64) -> tuple[F64, F64]:
+        """Normal equations of poses and mounting (width, width), right side (width,)."""
+        F, width = len(self.frames), 6 * len(self.frames) + COLUMNS
+        G, g = np.zeros((width, width)), np.zeros(width)
+        fixed = slice(6 * F, width)
+        for f in range(F):
+            mine = self.frame == f
+            own, W, r = slice(6 * f, 6 * f + 6), weight[mine, None, None], residual[mine].ravel()
+            J, J_mounting = by_pose[mine].reshape(-1, 6), by_mounting[mine].reshape(-1, COLUMNS)
+            WJ, WJ_mounting = (W * by_pose[mine]).reshape(-1, 6), (W * by_mounting[mine]).reshape(-1, COLUMNS)
+            G[own, own], G[own, fixed] = WJ.T @ J, WJ.T @ J_mounting
+            G[fixed, own] = G[own, fixed].T
+            G[fixed, fixed] += WJ_mounting.T @ J_mounting
+            g[own] = WJ.T @ r
+            g[fixed] += WJ_mounting.T @ r
+        return G, g
 
     def _of_points(
         self, weight: F64, residual: F64, by_pose: F64, by_mounting: F64, by_point: F64
