@@ -13,10 +13,12 @@ from gnss_scene import BASE_ECEF, BASE_WORLD, DATUM, broadcast, circling, rover,
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from air.gnss.ephemerides import HeldEphemerides, is_healthy
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
 from air.gnss.positioning import Refused
 from air.odometry.gnss_base import MAX_AGE_S
+from air.odometry.gnss_corrections import correct
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
 from air.odometry.gnss_settings import GnssSelection, GnssSettings
 from air.sources.simulated.gnss.antenna import fixed_antenna
@@ -268,3 +270,28 @@ def way_by_carriers(a: CleanEpoch, b: CleanEpoch) -> F64 | None:
     moved = np.array([b.carrier[i] - there[0][i] - then[b.arcs[i]] for i in both])
     H = np.column_stack([-there[1][both], np.ones(len(both))])
     return np.asarray(np.linalg.lstsq(H, moved, rcond=None)[0][:3])
+
+
+def test_a_new_model_of_the_ionosphere_or_ephemeris_breaks_no_carrier_unseen() -> None:
+    """A model that comes in flight moves codes alone; another ephemeris is taken late, and begins new arcs."""
+    held = HeldEphemerides(broadcast(sky(PERFECT), 10.0))
+    epoch = observed(PERFECT, 3.0)[-1].epoch
+    before = correct(epoch, held, BASE_ECEF)
+    newest = held.ionosphere()
+    assert newest is not None
+    held.add(replace(newest, alpha=tuple(3 * a + 1e-8 for a in newest.alpha)))
+    after = correct(epoch, held, BASE_ECEF)
+    np.testing.assert_array_equal(after.carrier, before.carrier)
+    assert np.nanmax(np.abs(after.code - before.code)) > 0.5
+
+    satellite = before.satellites[0]
+    old = held.find(satellite, epoch.t_ns)
+    assert old is not None
+    fresh = replace(old, toe_ns=epoch.t_ns + 1, t_ns=epoch.t_ns)
+    held.add(fresh)
+    assert held.find(satellite, epoch.t_ns) is old
+    assert held.find(satellite, old.toe_ns + 7300 * SECOND_NS) is fresh
+    held.add(replace(fresh, health=1, toe_ns=epoch.t_ns + 2))
+    newer = held.find(satellite, epoch.t_ns + 2)
+    assert newer is not None
+    assert not is_healthy(newer)

@@ -9,6 +9,8 @@ from common.measurements import Ephemeris, GlonassEphemeris, Ionosphere, KeplerE
 
 MAX_AGE_S = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 """How far from its reference time an ephemeris is used."""
+FRESH_S = {"R": 900.0, "E": 7200.0}
+"""How far from its reference time one stays in use where another has come: an hour unless it says so here."""
 MAX_ISSUES = 256
 """Issues kept of each satellite: more than a day's; the oldest go first."""
 
@@ -61,6 +63,37 @@ class Ephemerides:
     def ionosphere(self) -> Ionosphere | None:
         """The model as broadcast, of GPS if there is one, else of QZSS or BeiDou."""
         return next((self._ionosphere[system] for system in "GJC" if system in self._ionosphere), None)
+
+    def steady_ionosphere(self) -> Ionosphere | None:
+        """The model for carriers."""
+        return self.ionosphere()
+
+
+class HeldEphemerides(Ephemerides):
+    """Ephemerides that stay, for a satellite, with the issue that it was found with first, while that is fresh.
+
+    From one issue, and one model of the ionosphere, to the next ranges step by decimetres, and carriers seem to slip.
+    """
+
+    def __init__(self, broadcast: Iterable[Measurement] = ()):
+        super().__init__(broadcast)
+        self._held: dict[str, Ephemeris] = {}
+        self._steady: tuple[Ionosphere | None] | None = None
+
+    def find(self, satellite: str, t_ns: int) -> Ephemeris | None:
+        """The ephemeris in use; another one once that is old, or the health of the satellite has changed."""
+        newest, held = super().find(satellite, t_ns), self._held.get(satellite)
+        if newest is None:
+            return None
+        fresh_ns = FRESH_S.get(satellite[:1], 3600.0) * 1e9
+        if held is None or abs(t_ns - held.toe_ns) > fresh_ns or is_healthy(held) != is_healthy(newest):
+            held = self._held[satellite] = newest
+        return held
+
+    def steady_ionosphere(self) -> Ionosphere | None:
+        """The model that was there when one was asked for first."""
+        self._steady = self._steady or (self.ionosphere(),)
+        return self._steady[0]
 
 
 def is_healthy(ephemeris: Ephemeris) -> bool:

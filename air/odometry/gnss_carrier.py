@@ -1,8 +1,8 @@
 """Unbroken carriers: which signals keep their phase from epoch to epoch, and which slipped.
 
 A carrier that slips departs from its own Doppler, or from the carrier of the satellite's other band (the
-geometry-free combination), or its receiver says so by its lock time. Source: Teunissen and Montenbruck, Springer
-Handbook of GNSS, 8.4 and 20.5.
+geometry-free combination), or its receiver says so by its lock time. With another ephemeris its range steps, which
+amounts to the same. Source: Teunissen and Montenbruck, Springer Handbook of GNSS, 8.4 and 20.5.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ _BEND_PER_S2 = 5.0
 
 @dataclass(frozen=True)
 class _Seen:
-    """A carrier when it was last seen: GPST s, m, m/s, s of lock, the number of its arc and when that began."""
+    """A carrier when it was last seen: GPST s, m, m/s, s of lock, the number of its arc and when that began, and the
+    ephemeris in it."""
 
     t_s: float
     carrier: float
@@ -31,6 +32,7 @@ class _Seen:
     lock_s: float
     arc: int
     since_s: float
+    issue: int
 
 
 class CarrierLocks:
@@ -63,7 +65,9 @@ class CarrierLocks:
                 arc, since_s = self._arcs, t_s - told
             else:
                 arc, since_s = before.arc, before.since_s
-            self._seen[key] = _Seen(t_s, carrier, float(signals.rate[i]), float(lock_s[i]), arc, since_s)
+            self._seen[key] = _Seen(
+                t_s, carrier, float(signals.rate[i]), float(lock_s[i]), arc, since_s, int(signals.issue[i])
+            )
             if t_s - since_s >= self._settings.min_lock_s:
                 arcs[i] = arc
         return arcs
@@ -84,6 +88,7 @@ class CarrierLocks:
         gone -= np.median(gone[known]) if known.any() else 0.0  # what all share is the receiver's clock
         slipped = np.abs(gone) > settings.max_slip + settings.max_slip * _BEND_PER_S2 * dt**2
         slipped |= (lock_s < told) | (lock_s < 0.99 * dt)
+        slipped |= [seen is not None and seen.issue != issue for seen, issue in zip(last, signals.issue, strict=True)]
         moved = dict(
             zip(zip(signals.satellites, signals.first.tolist(), strict=True), signals.carrier - before, strict=True)
         )

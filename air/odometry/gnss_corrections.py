@@ -33,7 +33,7 @@ class Signals:
     in ECEF at transmission, as the frame stood then. `code`, `carrier` (M,) m and `rate` (M,) m/s are free of the
     models; `carrier` is NaN where none is tracked, `rate` where there is no Doppler. `bend` (M,) is by how much the
     ionosphere delays more than at L1; `slant` (M,) by how much more than in the zenith; `elevation` (M,) rad; `told`
-    (M,) whether the satellite says by how much its signal is late.
+    (M,) whether the satellite says by how much its signal is late; `issue` (M,) tells one ephemeris from the next.
     """
 
     row: I64
@@ -50,6 +50,7 @@ class Signals:
     slant: F64
     elevation: F64
     told: Bool
+    issue: I64
 
     def ranges(self, p_ecef: F64) -> F64:
         """Distances (M,) m that the signals travel to a place (3,) m, the turn of the earth included."""
@@ -78,14 +79,17 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
     azimuth, elevation = azimuth_elevation(line, geodetic)
     angle = np.maximum(elevation, _LOWEST)
     bend = (L1_HZ / f) ** 2
-    ionosphere = bend * klobuchar(broadcast.ionosphere() or TYPICAL, epoch.t_ns, geodetic, azimuth, angle)[0]
+    of_code, of_carrier = (
+        bend * klobuchar(model or TYPICAL, epoch.t_ns, geodetic, azimuth, angle)[0]
+        for model in (broadcast.ionosphere(), broadcast.steady_ionosphere())
+    )
     troposphere = saastamoinen(geodetic, angle)[0]
     known = LIGHT * states.clock - troposphere
     late = [group_delay(one, signal, each) for one, signal, each in zip(ephemerides, signals, f.tolist(), strict=True)]
     keep = np.isfinite(known) & np.isfinite(f) & np.isfinite(states.position).all(axis=1) & (elevation > 0)
     index = np.flatnonzero(keep)
     with np.errstate(over="ignore"):
-        carrier = epoch.carrier_phase[rows] * LIGHT / f + known + ionosphere
+        carrier = epoch.carrier_phase[rows] * LIGHT / f + known + of_carrier
         rate = -epoch.doppler[rows] * LIGHT / f + LIGHT * states.drift
     return Signals(
         row=rows[index],
@@ -94,7 +98,7 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
         first=np.array([first for _, _, first in chosen], bool)[index],
         p_satellite=states.position[index],
         v_satellite=states.velocity[index],
-        code=(epoch.pseudorange[rows] + known - ionosphere - np.array(late, float))[index],
+        code=(epoch.pseudorange[rows] + known - of_code - np.array(late, float))[index],
         carrier=np.where(epoch.half_cycle[rows] | ~(np.abs(carrier) < _FAR), np.nan, carrier)[index],
         rate=np.where(np.abs(rate) < _FAST, rate, np.nan)[index],
         frequency=f[index],
@@ -102,6 +106,7 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
         slant=(1.0 + 16.0 * (0.53 - angle / np.pi) ** 3)[index],
         elevation=elevation[index],
         told=np.array([tells_group_delay(one) for one in ephemerides], bool)[index],
+        issue=np.array([one.toe_ns for one in ephemerides], np.int64)[index],
     )
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from air.gnss.ephemerides import Ephemerides
+from air.gnss.ephemerides import HeldEphemerides
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.positioning import PointPosition, Refused, find_position
 from air.gnss.settings import PositioningSettings
@@ -84,7 +84,7 @@ class GnssPreprocessor:
         """`base` (3,) m, ECEF, is where a base station stands whose epochs come by `add_base`, unless these tell it."""
         self._settings = settings
         selection = settings.selection
-        self.broadcast = Ephemerides()
+        self.broadcast = HeldEphemerides()
         self._point = PositioningSettings(
             elevation_mask_deg=selection.elevation_mask_deg, min_cn0=selection.min_cn0, exclude_outliers=True
         )

@@ -153,6 +153,7 @@ def uncorrected(epoch):
         slant=unknown,
         elevation=unknown,
         told=np.ones(len(row), bool),
+        issue=np.zeros(len(row), np.int64),
     )
 
 
