@@ -18,6 +18,7 @@ from air.gnss.gnss_time import SECOND_NS
 from air.gnss.orbit import geometric_range
 from air.gnss.positioning import Refused
 from air.odometry.gnss_base import MAX_AGE_S
+from air.odometry.gnss_carrier import CarrierLocks
 from air.odometry.gnss_corrections import correct
 from air.odometry.gnss_preprocessing import CleanEpoch, GnssPreprocessor
 from air.odometry.gnss_settings import GnssSelection, GnssSettings
@@ -295,3 +296,12 @@ def test_a_new_model_of_the_ionosphere_or_ephemeris_breaks_no_carrier_unseen() -
     newer = held.find(satellite, epoch.t_ns + 2)
     assert newer is not None
     assert not is_healthy(newer)
+
+
+def test_an_epoch_whose_satellites_nobody_knows_is_cleaned_to_nothing() -> None:
+    epoch = observed(PERFECT, 1.0)[-1].epoch
+    nothing = correct(epoch, HeldEphemerides(), BASE_ECEF)
+    assert CarrierLocks(GnssSelection()).step(0.0, nothing, np.zeros(0)).shape == (0,)
+    cleaner = GnssPreprocessor(GnssSettings(), BASE_ECEF)
+    cleaner.add_base(epoch)
+    assert isinstance(cleaner.clean(epoch, BASE_ECEF), Refused)

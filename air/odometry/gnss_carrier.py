@@ -88,7 +88,8 @@ class CarrierLocks:
         gone -= np.median(gone[known]) if known.any() else 0.0  # what all share is the receiver's clock
         slipped = np.abs(gone) > settings.max_slip + settings.max_slip * _BEND_PER_S2 * dt**2
         slipped |= (lock_s < told) | (lock_s < 0.99 * dt)
-        slipped |= [seen is not None and seen.issue != issue for seen, issue in zip(last, signals.issue, strict=True)]
+        others = [seen is not None and seen.issue != issue for seen, issue in zip(last, signals.issue, strict=True)]
+        slipped |= np.array(others, bool)
         moved = dict(
             zip(zip(signals.satellites, signals.first.tolist(), strict=True), signals.carrier - before, strict=True)
         )
