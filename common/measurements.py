@@ -11,6 +11,9 @@ from enum import StrEnum
 
 from common.arrays import F64, I32, Bool
 
+BASE = "base"
+"""Name of the receiver of a base station."""
+
 
 @dataclass(frozen=True)
 class RawBytes:

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from common import rtcm
 from common.arrays import F64
 from common.bus import Bus
 from common.clock import Clock
-from common.geo import T_ecef_enu
+from common.geo import geodetic_to_ecef
 from common.keys import stream_key
 from common.link import Link, open_link
-from common.measurements import RawBytes
-from common.messages import Datum
+from common.measurements import BASE, RawBytes
 from common.streams import RTCM
 from common.wire import encode
 from ground.config import CorrectionsConfig
 from ground.link_reader import LinkReader
 
-DEVICE = "base"
 PLACE_EVERY_NS = 10_000_000_000
 ENOUGH_BYTES = 10_000
 """Among so many there is a frame, or never."""
@@ -87,10 +83,10 @@ class CorrectionsNode(LinkReader):
         if counts.received_bytes > ENOUGH_BYTES and not counts.frames:
             self._note("no RTCM 3 arrives; check the baud rate, and that the receiver sends it")
         if passed:
-            self._bus.publish(self._key, encode(RawBytes(self._clock.now_ns(), DEVICE, passed)), RTCM)
+            self._bus.publish(self._key, encode(RawBytes(self._clock.now_ns(), BASE, passed)), RTCM)
         return bool(passed)
 
 
 def _place(position: tuple[float, ...]) -> F64 | None:
     """ECEF (3,) m of latitude, longitude and height."""
-    return T_ecef_enu(Datum("", *position)).apply(np.zeros(3)) if position else None
+    return geodetic_to_ecef(*position) if position else None

@@ -22,15 +22,22 @@ from air.sensors.calibration import Calibration
 from common.arrays import F64, U8
 from common.camera import CameraModel
 from common.gravity import normal_gravity
-from common.measurements import CameraFrame, Encoding, FixKind, GnssEpoch, ImuSample, Measurement, ReceiverSolution
+from common.measurements import (
+    BASE,
+    CameraFrame,
+    Encoding,
+    FixKind,
+    GnssEpoch,
+    ImuSample,
+    Measurement,
+    ReceiverSolution,
+)
 from common.messages import Datum, EstimatorState, Keyframe, Mode, Photo, Pose
 from common.se3 import SE3
 
 Output = Pose | Keyframe | EstimatorState | Datum | Jump
 Stage = Callable[[str], AbstractContextManager[None]]
 """What is entered for each of the named parts of the work."""
-BASE = "base"
-"""Name of the base station's receiver."""
 WAITING = 60
 """Frames that wait for the IMU; older ones are given up."""
 MIN_SIGMA_SPEED, UNKNOWN_SIGMA_SPEED = 0.1, 0.5
@@ -68,7 +75,6 @@ class Odometry:
         self._settings = settings or OdometrySettings()
         self._calibration, self._flight, self._stage = calibration, flight, stage
         self._time_offset_s = 0.0 if calibration is None else calibration.time_offset_s
-        self._T_body_cam = T_body_cam
         self._tracker = None if calibration is None else Tracker(calibration.camera, self._settings.tracker)
         focal = 1.0 if calibration is None else calibration.camera.fx
         self.estimator = Estimator(focal, T_body_cam, self._settings, flight, base)
@@ -98,7 +104,8 @@ class Odometry:
             poses: list[Output] = [] if state is None else [self._pose(state)]
             return poses + self._frames() + self._epochs()
         if isinstance(message, ReceiverSolution):
-            self._learn(message)
+            if message.receiver != BASE:
+                self._learn(message)
         elif isinstance(message, GnssEpoch):
             self._hear_base(message) if message.receiver == BASE else self.estimator.gnss.add_epoch(message)
         else:
@@ -180,7 +187,8 @@ class Odometry:
         if self._tracked_ns is None:
             return np.eye(3)
         R_body = self.estimator.buffer.between(self._tracked_ns, t_ns).turn(self.estimator.gyro_bias())
-        return self._T_body_cam.R.T @ R_body @ self._T_body_cam.R
+        R_body_cam = self.estimator.mounted.now.T_body_cam.R
+        return R_body_cam.T @ R_body @ R_body_cam
 
     # What is told
 

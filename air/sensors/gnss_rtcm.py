@@ -13,10 +13,8 @@ from air.sensors.driver import Counts, TimeScale
 from common import rtcm
 from common.arrays import F64
 from common.framing import FrameScanner
-from common.measurements import GnssEpoch, Measurement
+from common.measurements import BASE, GnssEpoch, Measurement
 
-BASE = "base"
-"""Name of the base station's receiver."""
 AGAIN_NS = 60_000_000_000
 """What is so much older than the last epoch, or less, has come twice or too late."""
 

@@ -18,7 +18,7 @@ from air.sensors.calibration import Calibration
 from air.sources.source import Sensed
 from common.arrays import F64
 from common.geo import T_ecef_enu, ecef_to_geodetic, geodetic_to_ecef
-from common.measurements import CameraFrame, Encoding, FixKind, ReceiverSolution, VehicleState
+from common.measurements import BASE, CameraFrame, Encoding, FixKind, ReceiverSolution, VehicleState
 from common.messages import Datum, GnssFix, Photo, Pose
 from common.se3 import SE3, quaternion_to_matrix, rotation_vector, rotation_vector_to_matrix
 
@@ -73,7 +73,7 @@ class StillPicker:
         After a `Datum` frames wait for the odometry's poses in its world, as long as such come.
         """
         match measurement:
-            case ReceiverSolution(receiver=receiver, kind=kind) if receiver != "base" and kind is not FixKind.NONE:
+            case ReceiverSolution(receiver=receiver, kind=kind) if receiver != BASE and kind is not FixKind.NONE:
                 if np.isfinite(measurement.height):
                     self._solution = measurement
                     self._lowest = min(self._lowest, measurement.height)

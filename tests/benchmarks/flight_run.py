@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from air.odometry.estimator import Estimate
-from air.odometry.odometry import BASE, Odometry
+from air.odometry.odometry import Odometry
 from air.odometry.settings import OdometrySettings
 from air.odometry.smoothing import Smoother
 from air.odometry.tracker import TrackedFrame
 from common.geo import T_world_other
-from common.measurements import GnssEpoch, ImuSample
+from common.measurements import BASE, GnssEpoch, ImuSample
 from common.se3 import rotation_vector
 from ground.evaluation.similarity import umeyama
 
