@@ -57,8 +57,7 @@ def find_trajectory(
     given = None if calibration is None else ("", read_calibration(calibration))
     camera, mounting = given or mounted(known) or ("", None)
     odometry = Odometry(mounting, "flight", with_lever_arm(settings, known), known.p_base_ecef, watch.stage)
-    smoother = Smoother(odometry.estimator.buffer)
-    odometry.estimator.history = smoother if smooth else None
+    smoother = odometry.estimator.history = Smoother(odometry.estimator.buffer) if smooth else None
     frames, epochs = 0, 0
     for message in tqdm(source, unit=" items", leave=False, disable=True if quiet else None):
         if isinstance(message, CameraFrame):
@@ -85,9 +84,9 @@ def find_trajectory(
         stages_s=watch.stages,
         peak_memory_bytes=peak_memory(),
     )
-    if smooth and odometry.estimator.window is not None:
+    if smoother is not None and odometry.estimator.window is not None:
         smoother.ended(odometry.estimator.window)
-    _write(out, told, report, smoother if smooth else None)
+    _write(out, told, report, smoother)
     return report
 
 

@@ -73,9 +73,9 @@ class Estimator:
         """`base` (3,) m, ECEF, is where a base station stands. Without a camera neither its focal length px nor where
         it sits matters."""
         self._settings = settings or OdometrySettings()
-        self._focal, self._T_body_cam = focal, T_body_cam or SE3.identity()
+        self._focal = focal
         lever_arm = np.array(self._settings.gnss.p_body_antenna)
-        self.mounted = Mounted.beforehand(Mounting(self._T_body_cam, lever_arm), self._settings.mounting)
+        self.mounted = Mounted.beforehand(Mounting(T_body_cam or SE3.identity(), lever_arm), self._settings.mounting)
         """What is known of the mounting; it outlives the window."""
         self.buffer = ImuBuffer(self._settings.imu)
         self.gnss = GnssCoupling(self._settings.gnss, self.buffer, flight, base)
@@ -92,7 +92,7 @@ class Estimator:
         """Who remembers what leaves the window; set before the flight begins."""
 
     def _new_initialization(self) -> Initialization:
-        return Initialization(self._focal, self._T_body_cam, self.buffer, self._settings)
+        return Initialization(self._focal, self.mounted.now.T_body_cam, self.buffer, self._settings)
 
     @property
     def window(self) -> Window | None:
