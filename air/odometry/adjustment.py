@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from air.odometry.mounting import COLUMNS, MOUNTING
+from air.odometry.mounting import MOUNTING
 from air.odometry.quadratic import NormalEquations, Quadratic, dimension
 from air.odometry.sightings import LinearSightings, Sightings
 from common.arrays import F64
@@ -21,13 +21,20 @@ TOLERANCE, SMALL_TURN, SMALL_SHIFT = 1e-4, 2e-4, 0.005
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The values that were found, the covariances of the newest pose (6, 6) and of the mounting (10, 10), and how many
-    iterations it took."""
+    """The values that were found, the covariances of the newest pose (6, 6) and of the mounting (10, 10), how many
+    iterations it took, and the `equations` of the last one, of which `chain` are to be eliminated first."""
 
     values: gtsam.Values
     pose_covariance: F64
     mounting_covariance: F64
     iterations: int
+    equations: NormalEquations
+    chain: Sequence[int]
+
+    def covariance_of(self, key: int) -> F64:
+        """Covariance (D, D) of a variable that is no point. Raises LinAlgError where it is undetermined, KeyError
+        where it was not there."""
+        return self.equations.solve([key], [other for other in self.chain if other != key])[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,24 +59,22 @@ class Problem:
 
 
 def adjust(problem: Problem, values: gtsam.Values, iterations: int) -> Adjusted:
-    """The values that fit best, after some iterations at most. Raises LinAlgError where anything is undetermined."""
-    error, covariance, done = problem.error(values), np.eye(6 + COLUMNS), 0
-    while done < iterations:
+    """The values that fit best, after at least one iteration. Raises LinAlgError where anything is undetermined."""
+    held = 6 + np.array(problem.held, np.int64)
+    error, done = problem.error(values), 0
+    while True:
         done += 1
-        change, covariance = _step(problem, values)
+        seen = problem.sightings.linearised(values)
+        equations = equations_of(problem.inertial, seen, problem.known, values)
+        change, covariance = equations.solve([problem.poses[-1], MOUNTING], problem.chain, held)
+        change |= seen.points(change)
         new, new_error = _descent(problem, values, change, error)
         if not new_error <= error:
             break
         improved, values, error = error - new_error, new, new_error
-        if improved < TOLERANCE * error or _is_small(change, problem.poses):
+        if done >= iterations or improved < TOLERANCE * error or _is_small(change, problem.poses):
             break
-    return Adjusted(values, covariance[:6, :6], covariance[6:, 6:], done)
-
-
-def covariance_of(key: int, problem: Problem, values: gtsam.Values) -> F64:
-    """Covariance (D, D) of one variable that is no point. Raises LinAlgError where it is undetermined."""
-    equations = equations_of(problem.inertial, problem.sightings.linearised(values), problem.known, values)
-    return equations.solve([key], [other for other in problem.chain if other != key])[1]
+    return Adjusted(values, covariance[:6, :6], covariance[6:, 6:], done, equations, problem.chain)
 
 
 def equations_of(
@@ -89,14 +94,6 @@ def equations_of(
         here = one.at(values)
         equations.add(here.point, here.G, here.g)
     return equations
-
-
-def _step(problem: Problem, values: gtsam.Values) -> tuple[dict[int, F64], F64]:
-    seen = problem.sightings.linearised(values)
-    equations = equations_of(problem.inertial, seen, problem.known, values)
-    held = 6 + np.array(problem.held, np.int64)
-    change, covariance = equations.solve([problem.poses[-1], MOUNTING], problem.chain, held)
-    return change | seen.points(change), covariance
 
 
 def _is_small(change: Mapping[int, F64], poses: Sequence[int]) -> bool:

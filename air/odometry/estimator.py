@@ -257,10 +257,10 @@ class Estimator:
         depths = window.depths(predicted)
         usual = float(np.median(list(depths.values()))) if depths else np.inf
         window.add(frame.t_ns, self._points_at(frame, predicted, depths, usual), predicted, still)
+        fixed = self.gnss.fix(window)
         solution = window.solve()
         if why := self._astray(window, solution, predicted):
             return self._repair(window, frame, predicted, why)
-        fixed = self.gnss.fix(window) and not window.solve().failed
         jump = self._jump(window, predicted, fixed)
         keyframe = window.state(-2) if window.slide() else None
         self._propagate_from(window.state())

@@ -1,5 +1,6 @@
 """A base station: what the measurements of a known place tell of the errors that a rover nearby has as well.
 
+Its own noise and echoes would come along, were its codes not smoothed by its carriers.
 Source: Misra and Enge, Global Positioning System, 5.6 (differential corrections of code and carrier).
 """
 
@@ -11,6 +12,8 @@ import numpy as np
 
 from air.gnss.ephemerides import Ephemerides
 from air.gnss.gnss_time import SECOND_NS
+from air.odometry.carrier_rates import CarrierRates
+from air.odometry.code_smoothing import CodeSmoother
 from air.odometry.gnss_carrier import CarrierLocks
 from air.odometry.gnss_corrections import Signals, correct
 from air.odometry.gnss_settings import GnssSelection
@@ -22,21 +25,33 @@ MOVED = 0.05
 """A base that is so far away, m, from where it stood has moved."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Residuals:
-    """What is left of the code and the carrier m of each signal at the base, and the arcs of the carriers."""
+@dataclass(frozen=True)
+class _Left:
+    """What is left of a signal at the base: of its code m, smoothed over some s, of its carrier m, of its rate m/s;
+    and the arc of the carrier. NaN, and −1, where unknown."""
 
-    t_s: float
-    code: dict[tuple[str, bool], float]
-    carrier: dict[tuple[str, bool], tuple[float, int]]
+    code: float = np.nan
+    over_s: float = 0.0
+    carrier: float = np.nan
+    rate: float = np.nan
+    arc: int = -1
+
+
+_UNKNOWN = _Left()
 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """For M signals of a rover: `code`, `carrier` (M,) m to take off, NaN where unknown; `arc` (M,), −1 if unknown."""
+    """For M signals of a rover: `code`, `carrier` (M,) m and `rate` (M,) m/s to take off, NaN where unknown; `arc`
+    (M,), −1 if unknown.
+
+    The base's codes were smoothed for `over_s` (M,).
+    """
 
     code: F64
+    over_s: F64
     carrier: F64
+    rate: F64
     arc: I64
 
 
@@ -49,7 +64,9 @@ class BaseStation:
         self.fault = ""
         """Why its measurements are of no use, if they are not."""
         self._locks = CarrierLocks(settings)
-        self._newest: _Residuals | None = None
+        self._smoother, self._rates = CodeSmoother(), CarrierRates()
+        self._newest: dict[tuple[str, bool], _Left] = {}
+        self._newest_s = -np.inf
 
     def add(self, epoch: GnssEpoch, broadcast: Ephemerides) -> None:
         """Take an epoch by the base's clock; one of an unknown place, or of another place than before, is refused."""
@@ -61,10 +78,10 @@ class BaseStation:
         if moved > MOVED:
             # The world would jump along with it, and the map be torn.
             self.fault = f"the base station has moved by {moved:.2f} m: put it back, or begin a new flight"
-            self._newest = None
+            self._newest = {}
             return
         self.fault = ""
-        if self._newest is not None and 0.0 <= self._newest.t_s - epoch.t_ns / SECOND_NS < MAX_AGE_S:
+        if 0.0 <= self._newest_s - epoch.t_ns / SECOND_NS < MAX_AGE_S:
             return  # it came twice, or late: carriers go forwards
         self._take(epoch, correct(epoch, broadcast, self.p_ecef), self.p_ecef)
 
@@ -72,21 +89,21 @@ class BaseStation:
         t_s = epoch.t_ns / SECOND_NS
         arcs = self._locks.step(t_s, signals, epoch.lock_s[signals.row])
         ranges = signals.ranges(p_ecef)
-        keys = list(zip(signals.satellites, signals.first.tolist(), strict=True))
-        code = dict(zip(keys, (signals.code - ranges).tolist(), strict=True))
-        carrier = zip(keys, (signals.carrier - ranges).tolist(), arcs.tolist(), strict=True)
-        self._newest = _Residuals(t_s, code, {key: (value, arc) for key, value, arc in carrier if arc >= 0})
+        smooth, over_s = self._smoother.step(t_s, signals, arcs)
+        code, carrier = smooth - ranges, np.where(arcs >= 0, signals.carrier - ranges, np.nan)
+        rate = self._rates.step(t_s, signals, carrier, arcs)
+        rows = zip(code.tolist(), over_s.tolist(), carrier.tolist(), rate.tolist(), arcs.tolist(), strict=True)
+        self._newest = {key: _Left(*row) for key, row in zip(signals.keys, rows, strict=True)}
+        self._newest_s = t_s
 
     def differences(self, t_s: float, signals: Signals) -> Differences:
         """What to take off the signals of a rover at GPST `t_s`; all unknown when the base fell silent."""
-        newest = self._newest
-        if newest is None or abs(t_s - newest.t_s) > MAX_AGE_S:
-            nothing = np.full(len(signals.satellites), np.nan)
-            return Differences(nothing, nothing, np.full(len(nothing), -1, np.int64))
-        keys = list(zip(signals.satellites, signals.first.tolist(), strict=True))
-        carriers = [newest.carrier.get(key, (np.nan, -1)) for key in keys]
+        heard = abs(t_s - self._newest_s) <= MAX_AGE_S
+        left = [self._newest.get(key, _UNKNOWN) if heard else _UNKNOWN for key in signals.keys]
         return Differences(
-            code=np.array([newest.code.get(key, np.nan) for key in keys], float),
-            carrier=np.array([value for value, _ in carriers], float),
-            arc=np.array([arc for _, arc in carriers], np.int64),
+            code=np.array([one.code for one in left], float),
+            over_s=np.array([one.over_s for one in left], float),
+            carrier=np.array([one.carrier for one in left], float),
+            rate=np.array([one.rate for one in left], float),
+            arc=np.array([one.arc for one in left], np.int64),
         )

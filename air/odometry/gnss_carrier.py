@@ -49,7 +49,7 @@ class CarrierLocks:
 
         `lock_s` (M,) is what the receiver says, NaN where it does not.
         """
-        keys = list(zip(signals.satellites, signals.first.tolist(), strict=True))
+        keys = signals.keys
         last = [self._last(key, t_s) for key in keys]
         slipped = self._slipped(t_s, signals, lock_s, last)
         arcs = np.full(len(keys), -1, np.int64)
@@ -90,9 +90,7 @@ class CarrierLocks:
         slipped |= (lock_s < told) | (lock_s < 0.99 * dt)
         others = [seen is not None and seen.issue != issue for seen, issue in zip(last, signals.issue, strict=True)]
         slipped |= np.array(others, bool)
-        moved = dict(
-            zip(zip(signals.satellites, signals.first.tolist(), strict=True), signals.carrier - before, strict=True)
-        )
+        moved = dict(zip(signals.keys, signals.carrier - before, strict=True))
         for i, satellite in enumerate(signals.satellites):
             split = moved.get((satellite, True), np.nan) - moved.get((satellite, False), np.nan)
             slipped[i] |= abs(split) > settings.max_split

@@ -34,6 +34,8 @@ class Signals:
     models; `carrier` is NaN where none is tracked, `rate` where there is no Doppler. `bend` (M,) is by how much the
     ionosphere delays more than at L1; `slant` (M,) by how much more than in the zenith; `elevation` (M,) rad; `told`
     (M,) whether the satellite says by how much its signal is late; `issue` (M,) tells one ephemeris from the next.
+    `renewed` (M,) m is by how much the newest model of the ionosphere, which codes take, delays more than the one that
+    carriers keep to.
     """
 
     row: I64
@@ -51,6 +53,12 @@ class Signals:
     elevation: F64
     told: Bool
     issue: I64
+    renewed: F64
+
+    @property
+    def keys(self) -> list[tuple[str, bool]]:
+        """Satellite and band of each signal."""
+        return list(zip(self.satellites, self.first.tolist(), strict=True))
 
     def ranges(self, p_ecef: F64) -> F64:
         """Distances (M,) m that the signals travel to a place (3,) m, the turn of the earth included."""
@@ -107,6 +115,7 @@ def correct(epoch: GnssEpoch, broadcast: Ephemerides, p_ecef: F64) -> Signals:
         elevation=elevation[index],
         told=np.array([tells_group_delay(one) for one in ephemerides], bool)[index],
         issue=np.array([one.toe_ns for one in ephemerides], np.int64)[index],
+        renewed=(of_code - of_carrier)[index],
     )
 
 

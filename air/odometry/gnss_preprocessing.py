@@ -158,7 +158,7 @@ class GnssPreprocessor:
         known_rate = signals.sigma_rate(epoch) <= s.max_sigma_rate
         signals = replace(signals, rate=np.where(known_rate, signals.rate, np.nan))
         measured = _Measured(signals, arcs, _loudness(epoch.cn0[signals.row]))
-        measured, usable = measured.minus(self.base.differences(epoch.t_ns / SECOND_NS, signals), usable)
+        measured, usable = measured.minus(self.base.differences(epoch.t_ns / SECOND_NS, signals), usable, noise.base_s)
         second = {name: i for i, name in enumerate(signals.satellites) if not signals.first[i] and usable[i]}
         first = [i for i in range(len(signals.satellites)) if signals.first[i] and usable[i]]
         rows = [measured.of(i, second.get(signals.satellites[i])) for i in first]
@@ -170,6 +170,7 @@ class GnssPreprocessor:
         orbit = np.where(signals.told[first], orbit, np.maximum(orbit, _UNTOLD))
         air = np.hypot(noise.ionosphere * _of(rows, "air") * slant, noise.troposphere / np.sin(elevation))
         drift = np.hypot(noise.orbit_drift, noise.drift * slant * _of(rows, "air_drift"))
+        drift = np.where([row.drift_known for row in rows], noise.differential, 1.0) * drift
         glonass = np.where([name == "R" for name in system], _GLONASS, 1.0)
         left = noise.differential if measured.differential else 1.0
         return CleanEpoch(
@@ -185,9 +186,9 @@ class GnssPreprocessor:
             sigma_code=noise.code * _of(rows, "code_noise") * glonass,
             sigma_carrier=noise.carrier * _of(rows, "carrier_noise"),
             sigma_rate=noise.rate * _of(rows, "rate_noise"),
-            sigma_multipath=noise.multipath * (0.5 + 1.5 * np.exp(-elevation / _LOW)) * _of(rows, "multipath"),
-            sigma_slow=np.hypot(orbit, air) * left,
-            sigma_drift=drift * left,
+            sigma_multipath=noise.multipath * _growth(elevation) * _of(rows, "multipath"),
+            sigma_slow=np.hypot(np.hypot(orbit, air) * left, noise.base * _growth(elevation) * _of(rows, "base")),
+            sigma_drift=drift,
             elevation=elevation,
             offset=_of(rows, "carrier") - _of(rows, "code"),
             fix=fix,
@@ -212,7 +213,8 @@ class GnssPreprocessor:
 @dataclass(frozen=True)
 class _Row:
     """The bands of a satellite as one: `code`, `carrier` m and `rate` m/s, and what spoils these in units of a single
-    signal in the zenith. `air` is by how much the ionosphere is in the code, `air_drift` in Doppler and carrier."""
+    signal in the zenith. `air` is by how much the ionosphere is in the code, `air_drift` in Doppler and carrier; `base`
+    is what stays of the multipath of a base station, and `drift_known` whether it has told the drift too."""
 
     code: float
     rate: float
@@ -223,6 +225,8 @@ class _Row:
     carrier: float = np.nan
     carrier_noise: float = np.nan
     air_drift: float = 1.0
+    base: float = 0.0
+    drift_known: bool = False
     arc: str = ""
 
 
@@ -232,22 +236,34 @@ def _of(rows: list[_Row], name: str) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Signals with their arcs (M,) and how loud they are: sigma (M,) in units of that at 45 dBHz."""
+    """Signals with their arcs (M,) and how loud they are: sigma (M,) in units of that at 45 dBHz.
+
+    Of differences to a base station, its arcs (M,), what its codes keep of their multipath (M,), and whether it told
+    the drift (M,).
+    """
 
     signals: Signals
     arcs: I64
     sigma: F64
     differential: bool = False
     base_arcs: I64 | None = None
+    base_keeps: F64 | None = None
+    base_drifts: Bool | None = None
 
-    def minus(self, base: Differences, usable: Bool) -> tuple[_Measured, Bool]:
+    def minus(self, base: Differences, usable: Bool, correlated_s: float) -> tuple[_Measured, Bool]:
         """Differences to a base station, where it saw the same signals; all as they are when it saw too few of them."""
         both = usable & np.isfinite(base.code)
         if np.sum(both & self.signals.first) < _MIN_DIFFERENCES:
             return self, usable
-        signals = replace(self.signals, code=self.signals.code - base.code, carrier=self.signals.carrier - base.carrier)
+        signals = replace(
+            self.signals,
+            code=self.signals.code - base.code,
+            carrier=self.signals.carrier - base.carrier,
+            rate=self.signals.rate - np.nan_to_num(base.rate),
+        )
         arcs = np.where(base.arc >= 0, self.arcs, -1)
-        return _Measured(signals, arcs, self.sigma, True, base.arc), both
+        keeps = _kept_by_mean(base.over_s / correlated_s)
+        return _Measured(signals, arcs, self.sigma, True, base.arc, keeps, np.isfinite(base.rate)), both
 
     def of(self, i: int, j: int | None) -> _Row:
         """The signal `i` of the first band and, where there is one, `j` of the second as one row.
@@ -257,9 +273,21 @@ class _Measured:
         """
         s, name, loud = self.signals, self.signals.satellites[i], self.sigma
         bend = float(s.bend[i])
+        kept = np.zeros(len(loud)) if self.base_keeps is None else self.base_keeps
+        told = np.zeros(len(loud), bool) if self.base_drifts is None else self.base_drifts
         if j is None:
             noise = float(loud[i])
-            row = _Row(float(s.code[i]), float(s.rate[i]), noise, noise, 1.0, bend, air_drift=bend)
+            row = _Row(
+                code=float(s.code[i]),
+                rate=float(s.rate[i]),
+                code_noise=noise,
+                rate_noise=noise,
+                multipath=1.0,
+                air=bend,
+                air_drift=bend,
+                base=float(kept[i]),
+                drift_known=bool(told[i]),
+            )
         else:
             bands = [i, j]
             f1, f2 = s.frequency[bands] ** 2
@@ -273,12 +301,16 @@ class _Measured:
                 multipath=float(np.linalg.norm(free)),
                 air=float(mean @ s.bend[bands]) if self.differential else 0.0,
                 air_drift=float(mean @ s.bend[bands]),
+                base=float(np.linalg.norm(mean * kept[bands])),
+                drift_known=bool(told[bands].all()),
             )
         if self.arcs[i] < 0:
             return row
         first = replace(row, carrier=float(s.carrier[i]), carrier_noise=float(loud[i]))
         if self.base_arcs is not None:
-            return replace(first, air_drift=0.0, arc=f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base_arcs[i]}")
+            return replace(
+                first, air_drift=0.0, drift_known=True, arc=f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base_arcs[i]}"
+            )
         if j is None or self.arcs[j] < 0:
             return replace(first, air_drift=bend, arc=f"{name}/{self.arcs[i]}")
         return replace(
@@ -288,6 +320,17 @@ class _Measured:
             air_drift=0.0,
             arc=f"{name}/{self.arcs[i]}+{self.arcs[j]}",
         )
+
+
+def _growth(elevation: F64) -> F64:
+    """How multipath (M,) grows from the zenith down."""
+    return np.asarray(0.5 + 1.5 * np.exp(-elevation / _LOW))
+
+
+def _kept_by_mean(times: F64) -> F64:
+    """Sigma (M,) of the mean of a Gauss–Markov process of unit sigma over so many of its correlation times."""
+    t = np.maximum(times, 1e-3)
+    return np.asarray(np.sqrt(2.0 / t * (1.0 - (1.0 - np.exp(-t)) / t)))
 
 
 def _loudness(cn0: F64) -> F64:

@@ -43,8 +43,9 @@ class GnssNoise:
     GPS, and `ionosphere` and `troposphere` beyond the models, all together over `slow_s`. How fast these change,
     Doppler and carrier see: by `orbit_drift` m/s, and by `drift` m/s where the ionosphere is in it, over `drift_s`; a
     carrier's ambiguity wanders by `ambiguity_walk` m/√s besides, and the delay between two systems by `system_walk`
-    m/√s. Differences to a base station keep the share `differential` of what is slow. Residuals beyond `robust` sigmas
-    lose weight.
+    m/√s. Differences to a base station keep the share `differential` of what is slow, and have the base's own
+    multipath of the code, `base`, correlated over `base_s`, of which its carriers leave little with time. Residuals
+    beyond `robust` sigmas lose weight.
     """
 
     code: Sigma = 0.4
@@ -62,6 +63,8 @@ class GnssNoise:
     ambiguity_walk: Sigma = 0.001
     system_walk: Sigma = 0.01
     differential: Annotated[float, Range(0.0, 1.0)] = 0.02
+    base: Sigma = 0.3
+    base_s: Seconds = 60.0
     robust: Annotated[float, Range(1.0, 100.0)] = 4.0
 
 

@@ -110,7 +110,7 @@ class GnssWindow:
         self._tried_ns = newest_ns
         try:
             covariance = window.covariance_of(node.key)
-        except (RuntimeError, np.linalg.LinAlgError):
+        except (KeyError, np.linalg.LinAlgError):
             return False
         found = fix(node, window.values.atVector(node.key), covariance)
         if isinstance(found, str):

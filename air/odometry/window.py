@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 
-from air.odometry.adjustment import Problem, adjust, covariance_of, equations_of
+from air.odometry.adjustment import Adjusted, Problem, adjust, equations_of
 from air.odometry.companion import Companion, History
 from air.odometry.initial_prior import initial_prior
 from air.odometry.landmarks import View, depths, locate, misses
@@ -78,6 +78,7 @@ class Window:
         self._anchored: set[int] = set()
         self._prior: Quadratic | None = None
         self._covariance = np.eye(6)
+        self._adjusted: Adjusted | None = None
 
     # What is known
 
@@ -121,7 +122,7 @@ class Window:
         self.values.insert(MOUNTING, self.mounted.u)
         self.frames.append(Frame(k, state.t_ns, seen))
         self._prior = initial_prior(k, state, covariance, self._imu_settings).beside(self.mounted.prior())
-        self._covariance = covariance[:6, :6]
+        self._covariance, self._adjusted = covariance[:6, :6], None
 
     def predict(self, t_ns: int, index: int = -1) -> InertialState:
         """Where the state of a frame, by default of the newest, leads to by the IMU."""
@@ -222,13 +223,18 @@ class Window:
     def _adjust(self) -> int:
         """Iterations that it took."""
         adjusted = adjust(self._problem(), self.values, self._settings.iterations)
-        self.values, self._covariance = adjusted.values, adjusted.pose_covariance
+        self._adjusted, self.values, self._covariance = adjusted, adjusted.values, adjusted.pose_covariance
         self.mounted = self.mounted.told(self.values.atVector(MOUNTING), adjusted.mounting_covariance)
         return adjusted.iterations
 
     def covariance_of(self, key: int) -> F64:
-        """Covariance (D, D) of a companion's variable. Raises LinAlgError where it is undetermined."""
-        return covariance_of(key, self._problem(), self.values)
+        """Covariance (D, D) of a companion's variable in the last solution.
+
+        Raises LinAlgError where it is undetermined, KeyError where it was not there.
+        """
+        if self._adjusted is None:
+            raise KeyError(key)
+        return self._adjusted.covariance_of(key)
 
     def _problem(self) -> Problem:
         known = self._known()
