@@ -121,7 +121,8 @@ class EstimatorState:
     and `clock_drift` how fast it grows, s/s; `lever_arm` (3,) m is the antenna in body. `code_rms_m`, `doppler_rms_mps`
     and `carrier_rms_m` are the root mean squares of the residuals of what is in use. One sigma is known of the
     extrinsics: `rotation_sigma` (3,) rad in the camera's axes, `translation_sigma` (3,) m in the body's,
-    `time_offset_sigma_s`, `lever_arm_sigma` (3,) m.
+    `time_offset_sigma_s`, `lever_arm_sigma` (3,) m; and of `lens` (3,) px, which is the focal length and the principal
+    point of the camera, `lens_sigma` (3,) px.
     """
 
     flight: str
@@ -145,6 +146,8 @@ class EstimatorState:
     translation_sigma: F64 = field(default_factory=_unknown)
     time_offset_sigma_s: float = math.nan
     lever_arm_sigma: F64 = field(default_factory=_unknown)
+    lens: F64 = field(default_factory=_unknown)
+    lens_sigma: F64 = field(default_factory=_unknown)
 
 
 @dataclass(frozen=True, order=True)

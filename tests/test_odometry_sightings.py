@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import L, X
 
 from air.odometry.mounting import COLUMNS, MOUNTING, Mounted, Mounting, MountingSettings
 from air.odometry.quadratic import NormalEquations, dimension
-from air.odometry.sightings import HUBER, Lens, Sightings
+from air.odometry.sightings import HUBER, Lens, Seen, Sightings
 from common.arrays import F64
 from common.se3 import SE3, rotation_vector_to_matrix
 
@@ -94,7 +94,7 @@ def residuals(sightings: Sightings, values: gtsam.Values, key: int, delta: F64) 
 
 def test_derivatives_are_those_of_differences() -> None:
     sightings, values = scene(3)
-    values.update(MOUNTING, np.array([0.01, -0.02, 0.005, 0.01, 0.02, 0.03, 0.004, 0.1, 0.1, 0.1]))
+    values.update(MOUNTING, np.array([0.01, -0.02, 0.005, 0.01, 0.02, 0.03, 0.004, 0.1, 0.1, 0.1, 3.0, 2.0, -1.0]))
     by_pose, by_mounting, by_point = sightings._derivatives(sightings._projected(values))
     for key, mine, J in (
         (X(1), sightings.frame == 1, by_pose),
@@ -132,16 +132,25 @@ def test_a_correction_counts_once_the_flight_knows_it_better() -> None:
     again = told.told(np.zeros(COLUMNS), np.diag(mounted.sigma**2))
     assert np.flatnonzero(again.learnt).tolist() == [1, 6]  # for good
     exact = mounted.told(np.zeros(COLUMNS), np.diag((0.01 * mounted.sigma) ** 2))
-    assert not exact.learnt[7:].any()  # what is exact never moves
+    assert not exact.learnt[7:10].any()  # what is exact never moves
 
 
 def test_corrections_turn_the_camera_about_its_own_axes_and_shift_along_the_bodys() -> None:
-    u = np.array([0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.002, 0.0, 0.0, 0.05])
+    u = np.array([0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.002, 0.0, 0.0, 0.05, 2.0, 1.0, -1.0])
     now = NOMINAL.corrected(u)
     np.testing.assert_allclose(now.T_body_cam.R, DOWN @ rotation_vector_to_matrix(np.array([0, 0, 0.1])), atol=1e-12)
     np.testing.assert_allclose(now.T_body_cam.t, NOMINAL.T_body_cam.t + [0.01, 0, 0])
     np.testing.assert_allclose(now.p_body_antenna, [0, 0, 0.05])
     assert now.delay_s == 0.002
+    np.testing.assert_array_equal(now.lens, [2.0, 1.0, -1.0])
+
+
+def test_points_of_a_corrected_lens_are_where_a_calibrated_one_would_show_them() -> None:
+    p, delay_s, lens = np.array([[0.3, -0.2], [-0.6, 0.4]]), 0.004, np.array([5.0, -2.0, 1.5])
+    rate = np.array([[30.0, -50.0], [10.0, 20.0]])
+    seen = Seen(np.arange(2), (640.0 + lens[0]) * p + lens[1:] - delay_s * rate, rate)
+    corrected = seen.corrected(Mounting(delay_s=delay_s, lens=lens), 640.0)
+    np.testing.assert_allclose(corrected, 640.0 * p, atol=1e-9)
 
 
 def test_columns_that_are_held_stay_and_the_others_are_solved_with_them_held() -> None:

@@ -26,7 +26,7 @@ from common.measurements import ImuSample
 
 KNOWN = Sigmas(tilt=0.005, yaw=1e-4, position=1e-3, velocity=0.05, accel_bias=0.03, gyro_bias=0.003)
 IMU = ImuSettings()
-EXACT = Mounted.beforehand(Mounting(T_BODY_CAM), MountingSettings(camera_deg=0, camera_m=0, delay_s=0, antenna_m=0))
+EXACT = Mounted.beforehand(Mounting(T_BODY_CAM), MountingSettings(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 def ideal(frame: TrackedFrame) -> Seen:

@@ -301,7 +301,7 @@ STRATEGIES: dict[type[Any], st.SearchStrategy[Any]] = {
         *(_se3, _floats(10.0), _count, _count, st.floats(0.0, 1e3)),
         *(st.dictionaries(st.sampled_from("GREC"), _floats(1.0)), _unknown(1.0), _known_or_not(3)),
         *([_unknown_sigma] * 3),
-        *(_sigmas, _sigmas, _unknown_sigma, _sigmas),
+        *(_sigmas, _sigmas, _unknown_sigma, _sigmas, _known_or_not(3), _sigmas),
     ),
     Keyframe: st.builds(
         Keyframe,

@@ -21,7 +21,7 @@ TOLERANCE, SMALL_TURN, SMALL_SHIFT = 1e-4, 2e-4, 0.005
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The values that were found, the covariances of the newest pose (6, 6) and of the mounting (10, 10), how many
+    """The values that were found, the covariances of the newest pose (6, 6) and of the mounting (13, 13), how many
     iterations it took, and the `equations` of the last one, of which `chain` are to be eliminated first."""
 
     values: gtsam.Values

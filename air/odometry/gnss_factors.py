@@ -24,14 +24,14 @@ from air.odometry.mounting import ANTENNA, COLUMNS
 from common.arrays import F64, I64
 from common.se3 import SE3, skew
 
-STATES = 25
+STATES = 28
 """Columns of a keyframe: gtsam's tangent of its pose (rotation, translation, both in body), velocity, IMU biases; and
 of the corrections of the mounting."""
 
 
 @dataclass(frozen=True, eq=False)
 class AntennaMotion:
-    """The antenna `p_world` (3,) m and `v_world` (3,) m/s, and how they change with keyframe and mounting: (3, 25)."""
+    """The antenna `p_world` (3,) m and `v_world` (3,) m/s, and how they change with keyframe and mounting: (3, 28)."""
 
     p_world: F64
     v_world: F64
@@ -41,7 +41,7 @@ class AntennaMotion:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Rows of one or more epochs, as ½ (f − 2 gᵀδ + δᵀ G δ) of 25 columns of keyframe and mounting and D of a node.
+    """Rows of one or more epochs, as ½ (f − 2 gᵀδ + δᵀ G δ) of 28 columns of keyframe and mounting and D of a node.
 
     `rows` were used.
     """
@@ -84,7 +84,7 @@ def antenna_motion(
 
 
 def _of_antenna(by_antenna: F64) -> F64:
-    """Derivatives (3, 10) by the mounting of what changes with the lever arm only."""
+    """Derivatives (3, 13) by the mounting of what changes with the lever arm only."""
     out = np.zeros((3, COLUMNS))
     out[:, ANTENNA] = by_antenna
     return out

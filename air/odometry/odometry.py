@@ -14,7 +14,7 @@ from air.alignment.prepare import thumbnail
 from air.jump import Jump
 from air.odometry.estimator import Estimate, Estimator
 from air.odometry.initial import KnownSpeed, Refusal
-from air.odometry.mounting import ANTENNA, DELAY, SHIFT, TURN
+from air.odometry.mounting import ANTENNA, DELAY, LENS, SHIFT, TURN
 from air.odometry.preintegration import InertialState
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import Tracker
@@ -224,15 +224,15 @@ class Odometry:
 
     def _keyframe(self, state: InertialState, camera: CameraModel) -> Keyframe:
         index, self._keyframes = self._keyframes, self._keyframes + 1
-        images = [image for t_ns, image in self._images if t_ns == state.t_ns]
+        images, mounting = [image for t_ns, image in self._images if t_ns == state.t_ns], self.estimator.mounted.now
         return Keyframe(
             flight=self._flight,
             index=index,
             revision=self.estimator.revision,
             t_ns=state.t_ns,
             name=f"frame-{state.t_ns}",
-            T_world_cam=state.T_world_body @ self.estimator.mounted.now.T_body_cam,
-            camera=camera,
+            T_world_cam=state.T_world_body @ mounting.T_body_cam,
+            camera=with_lens(camera, mounting.lens),
             sigma=self._sigma,
             thumbnail=thumbnail(_rgb(images[0])) if images else b"",
         )
@@ -258,6 +258,9 @@ class Odometry:
             time_offset_sigma_s=float(sigma[DELAY][0]),
             lever_arm_sigma=sigma[ANTENNA],
         )
+        if self._calibration is not None:
+            camera = with_lens(self._calibration.camera, mounted.now.lens)
+            told = replace(told, lens=np.array([camera.fx, camera.cx, camera.cy]), lens_sigma=sigma[LENS])
         misfit = None if window is None else self.estimator.gnss.misfit(window)
         if misfit is None:
             return told
@@ -269,6 +272,13 @@ class Odometry:
             carrier_rms_m=misfit.carrier,
             doppler_rms_mps=misfit.rate,
         )
+
+
+def with_lens(camera: CameraModel, lens: F64) -> CameraModel:
+    """The camera with corrections (3,) px of its focal length and principal point."""
+    focal, cx, cy = lens.tolist()
+    fy = camera.fy * (1.0 + focal / camera.fx)
+    return replace(camera, fx=camera.fx + focal, fy=fy, cx=camera.cx + cx, cy=camera.cy + cy)
 
 
 def decoded(frame: CameraFrame) -> U8 | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from air.odometry.mounting import COLUMNS, DELAY, MOUNTING, SHIFT, TURN, Mounting
+from air.odometry.mounting import COLUMNS, DELAY, LENS, MOUNTING, SHIFT, TURN, Mounting
 from common.arrays import F64, I64, Bool
 
 HUBER = 1.345
@@ -25,8 +25,8 @@ BEHIND = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What one frame sees: `ids` (N,) rise; `xy` (N, 2) px are ideal image points from the centre of the image, moved
-    to where they were at the frame's time; they would be by `rate` (N, 2) px/s elsewhere if frames were later."""
+    """What one frame sees: `ids` (N,) rise; `xy` (N, 2) px are ideal image points from the principal point, moved to
+    where they were at the frame's time; they would be by `rate` (N, 2) px/s elsewhere if frames were later."""
 
     ids: I64
     xy: F64
@@ -45,9 +45,10 @@ class Seen:
         """The others."""
         return self._rows(~np.isin(self.ids, ids))
 
-    def late(self, delay_s: float) -> F64:
-        """Ideal image points (N, 2) px of frames that are late by so much."""
-        return self.xy + delay_s * self.rate
+    def corrected(self, mounting: Mounting, focal: float) -> F64:
+        """The ideal image points (N, 2) of a lens of `focal` px, were frames in time and the lens as calibrated."""
+        zoom, centre = 1.0 + mounting.lens[0] / focal, mounting.lens[1:]
+        return np.asarray((self.xy + mounting.delay_s * self.rate - centre) / zoom)
 
     def _rows(self, rows: Bool) -> Seen:
         return Seen(self.ids[rows], self.xy[rows], self.rate[rows])
@@ -147,22 +148,25 @@ class Sightings:
         p_cam = (p_body - mounting.T_body_cam.t) @ mounting.T_body_cam.R
         before = p_cam[:, 2] > NEAREST
         p_cam[~before, 2] = NEAREST
-        expected = self.lens.focal * p_cam[:, :2] / p_cam[:, 2:]
+        focal, centre = self.lens.focal + mounting.lens[0], mounting.lens[1:]
+        expected = focal * p_cam[:, :2] / p_cam[:, 2:] + centre
         residual = self.xy + mounting.delay_s * self.rate - expected
         return _Projected(mounting, R, p_body, p_cam, residual, before)
 
     def _derivatives(self, seen: _Projected) -> tuple[F64, F64, F64]:
-        """How the expected image points minus the seen ones change with poses (M, 2, 6), the mounting (M, 2, 10) and
+        """How the expected image points minus the seen ones change with poses (M, 2, 6), the mounting (M, 2, 13) and
         points (M, 2, 3)."""
-        m, (x, y, z) = len(self.xy), seen.p_cam.T
+        m, (x, y, z), focal = len(self.xy), seen.p_cam.T, self.lens.focal + seen.mounting.lens[0]
         by_cam = np.zeros((m, 2, 3))
-        by_cam[:, 0, 0] = by_cam[:, 1, 1] = self.lens.focal / z
-        by_cam[:, 0, 2], by_cam[:, 1, 2] = -self.lens.focal * x / z**2, -self.lens.focal * y / z**2
+        by_cam[:, 0, 0] = by_cam[:, 1, 1] = focal / z
+        by_cam[:, 0, 2], by_cam[:, 1, 2] = -focal * x / z**2, -focal * y / z**2
         by_body = by_cam @ seen.mounting.T_body_cam.R.T
         by_pose = np.concatenate([np.cross(by_body, seen.p_body[:, None]), -by_body], axis=2)
         by_mounting = np.zeros((m, 2, COLUMNS))
         by_mounting[:, :, TURN], by_mounting[:, :, SHIFT] = np.cross(by_cam, seen.p_cam[:, None]), -by_body
         by_mounting[:, :, DELAY] = -self.rate[:, :, None]
+        by_mounting[:, :, LENS] = np.eye(2, 3, 1)
+        by_mounting[:, :, LENS.start] = seen.p_cam[:, :2] / z[:, None]
         return by_pose, by_mounting, by_body @ seen.R_world_body.transpose(0, 2, 1)
 
 

@@ -153,7 +153,7 @@ class Window:
         now = self.mounted.now
         poses = [from_pose3(self.values.atPose3(X(frame.k))) @ now.T_body_cam for frame in self.frames]
         seen = [frame.seen for frame in self.frames]
-        return [View(T, s.ids, s.late(now.delay_s)) for T, s in zip(poses, seen, strict=True)]
+        return [View(T, s.ids, s.corrected(now, self._focal)) for T, s in zip(poses, seen, strict=True)]
 
     def _ids(self) -> I64:
         return np.array(sorted(self.points), np.int64)
