@@ -101,6 +101,7 @@ def epoch_at(p_world: F64, v_world: F64, clock: float, drift: float, biases: F64
         sigma_rate=0.05 * ones,
         sigma_multipath=3.0 * ones,
         sigma_slow=2.0 * ones,
+        slow_s=2700.0 * ones,
         sigma_drift=0.003 * ones,
         elevation=elevation,
         offset=np.where(with_carrier, 1000.0 * np.arange(n), np.nan),

@@ -235,7 +235,7 @@ class Estimator:
         s = self._settings
         if solution.failed or solution.points < s.degradation.enough_points:
             return f"only {solution.points} points agree"
-        if solution.rms_px > 2 * s.window.pixel_sigma:
+        if solution.rms_px > s.window.max_residual_px / 2:
             return f"points miss their places by {solution.rms_px:.1f} px"
         state = window.state()
         travelled = state.T_world_body.R.T @ (state.T_world_body.t - window.state(0).T_world_body.t)

@@ -88,7 +88,7 @@ def needed(epochs: Iterable[CleanEpoch], noise: GnssNoise) -> dict[Bias, tuple[P
             if np.isfinite(epoch.code[i]):
                 multipath = Process(0.0, float(epoch.sigma_multipath[i]), noise.multipath_s)
                 found[Kind.MULTIPATH, satellite] = multipath, t_ns
-                found[Kind.SLOW, satellite] = Process(0.0, float(epoch.sigma_slow[i]), noise.slow_s), t_ns
+                found[Kind.SLOW, satellite] = Process(0.0, float(epoch.sigma_slow[i]), float(epoch.slow_s[i])), t_ns
             if epoch.arcs[i]:
                 key = Kind.AMBIGUITY, epoch.arcs[i]
                 mean = found[key][0].mean if key in found else np.nan

@@ -43,9 +43,10 @@ class CleanEpoch:
     are taken, both end in "-base", for what spoils these is not what spoiled the ranges before. `p_satellite`,
     `v_satellite` (N, 3) are in ECEF at transmission. What models know is taken off `code`, `carrier` m and `rate` m/s
     (N,), all of which may be NaN. `arcs` (N,) names the unbroken carrier, empty where there is none. White noise is
-    `sigma_code`, `sigma_carrier`, `sigma_rate` (N,); what stays for a while is `sigma_multipath` and `sigma_slow` (N,)
-    m of the code, and `sigma_drift` (N,) m/s of Doppler and carrier. `fix` is the single-point position of the epoch,
-    None where it had none. `offset` (N,) m is by how much carrier and code differ: a first guess of the ambiguity.
+    `sigma_code`, `sigma_carrier`, `sigma_rate` (N,); what stays for a while is `sigma_multipath` and, for `slow_s`
+    (N,), `sigma_slow` (N,) m of the code, and `sigma_drift` (N,) m/s of Doppler and carrier. `fix` is the single-point
+    position of the epoch, None where it had none. `offset` (N,) m is by how much carrier and code differ: a first guess
+    of the ambiguity.
     """
 
     t_ns: int
@@ -62,6 +63,7 @@ class CleanEpoch:
     sigma_rate: F64
     sigma_multipath: F64
     sigma_slow: F64
+    slow_s: F64
     sigma_drift: F64
     elevation: F64
     offset: F64
@@ -158,12 +160,12 @@ class GnssPreprocessor:
         known_rate = signals.sigma_rate(epoch) <= s.max_sigma_rate
         signals = replace(signals, rate=np.where(known_rate, signals.rate, np.nan))
         measured = _Measured(signals, arcs, _loudness(epoch.cn0[signals.row]))
-        measured, usable = measured.minus(self.base.differences(epoch.t_ns / SECOND_NS, signals), usable, noise.base_s)
+        measured, usable = measured.minus(self.base.differences(epoch.t_ns / SECOND_NS, signals), usable)
         second = {name: i for i, name in enumerate(signals.satellites) if not signals.first[i] and usable[i]}
         first = [i for i in range(len(signals.satellites)) if signals.first[i] and usable[i]]
         rows = [measured.of(i, second.get(signals.satellites[i])) for i in first]
         elevation, slant = signals.elevation[first], signals.slant[first]
-        ending = DIFFERENTIAL if measured.differential else ""
+        ending = "" if measured.base is None else DIFFERENTIAL
         systems = tuple(signals.clocks[i] + ending for i in first)
         system = [signals.satellites[i][0] for i in first]
         orbit = noise.orbit * np.array([_ORBIT.get(name, 1.0) for name in system])
@@ -172,7 +174,14 @@ class GnssPreprocessor:
         drift = np.hypot(noise.orbit_drift, noise.drift * slant * _of(rows, "air_drift"))
         drift = np.where([row.drift_known for row in rows], noise.differential, 1.0) * drift
         glonass = np.where([name == "R" for name in system], _GLONASS, 1.0)
-        left = noise.differential if measured.differential else 1.0
+        multipath = _growth(elevation) * _of(rows, "multipath")
+        sigma_slow, slow_s = np.hypot(orbit, air), np.full(len(first), noise.slow_s)
+        if measured.base is not None:
+            # The mean of a base's multipath changes the less, the longer it has been taken.
+            base_s = _of(rows, "base_s")
+            sigma_base = noise.base * multipath * _kept_by_mean(base_s / noise.base_s)
+            sigma_slow = np.hypot(noise.differential * sigma_slow, sigma_base)
+            slow_s = np.clip(base_s, noise.base_s, noise.slow_s)
         return CleanEpoch(
             t_ns=t_ns,
             satellites=tuple(signals.satellites[i] + ending for i in first),
@@ -186,8 +195,9 @@ class GnssPreprocessor:
             sigma_code=noise.code * _of(rows, "code_noise") * glonass,
             sigma_carrier=noise.carrier * _of(rows, "carrier_noise"),
             sigma_rate=noise.rate * _of(rows, "rate_noise"),
-            sigma_multipath=noise.multipath * _growth(elevation) * _of(rows, "multipath"),
-            sigma_slow=np.hypot(np.hypot(orbit, air) * left, noise.base * _growth(elevation) * _of(rows, "base")),
+            sigma_multipath=noise.multipath * multipath,
+            sigma_slow=sigma_slow,
+            slow_s=slow_s,
             sigma_drift=drift,
             elevation=elevation,
             offset=_of(rows, "carrier") - _of(rows, "code"),
@@ -213,8 +223,8 @@ class GnssPreprocessor:
 @dataclass(frozen=True)
 class _Row:
     """The bands of a satellite as one: `code`, `carrier` m and `rate` m/s, and what spoils these in units of a single
-    signal in the zenith. `air` is by how much the ionosphere is in the code, `air_drift` in Doppler and carrier; `base`
-    is what stays of the multipath of a base station, and `drift_known` whether it has told the drift too."""
+    signal in the zenith. `air` is by how much the ionosphere is in the code, `air_drift` in Doppler and carrier; a
+    base station has smoothed its code for `base_s`, and `drift_known` says whether it has told the drift too."""
 
     code: float
     rate: float
@@ -225,7 +235,7 @@ class _Row:
     carrier: float = np.nan
     carrier_noise: float = np.nan
     air_drift: float = 1.0
-    base: float = 0.0
+    base_s: float = 0.0
     drift_known: bool = False
     arc: str = ""
 
@@ -236,21 +246,15 @@ def _of(rows: list[_Row], name: str) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Signals with their arcs (M,) and how loud they are: sigma (M,) in units of that at 45 dBHz.
-
-    Of differences to a base station, its arcs (M,), what its codes keep of their multipath (M,), and whether it told
-    the drift (M,).
-    """
+    """Signals with their arcs (M,) and how loud they are: sigma (M,) in units of that at 45 dBHz; and what was taken
+    off them, if they are differences to a base station."""
 
     signals: Signals
     arcs: I64
     sigma: F64
-    differential: bool = False
-    base_arcs: I64 | None = None
-    base_keeps: F64 | None = None
-    base_drifts: Bool | None = None
+    base: Differences | None = None
 
-    def minus(self, base: Differences, usable: Bool, correlated_s: float) -> tuple[_Measured, Bool]:
+    def minus(self, base: Differences, usable: Bool) -> tuple[_Measured, Bool]:
         """Differences to a base station, where it saw the same signals; all as they are when it saw too few of them."""
         both = usable & np.isfinite(base.code)
         if np.sum(both & self.signals.first) < _MIN_DIFFERENCES:
@@ -262,8 +266,7 @@ class _Measured:
             rate=self.signals.rate - np.nan_to_num(base.rate),
         )
         arcs = np.where(base.arc >= 0, self.arcs, -1)
-        keeps = _kept_by_mean(base.over_s / correlated_s)
-        return _Measured(signals, arcs, self.sigma, True, base.arc, keeps, np.isfinite(base.rate)), both
+        return _Measured(signals, arcs, self.sigma, base), both
 
     def of(self, i: int, j: int | None) -> _Row:
         """The signal `i` of the first band and, where there is one, `j` of the second as one row.
@@ -273,8 +276,6 @@ class _Measured:
         """
         s, name, loud = self.signals, self.signals.satellites[i], self.sigma
         bend = float(s.bend[i])
-        kept = np.zeros(len(loud)) if self.base_keeps is None else self.base_keeps
-        told = np.zeros(len(loud), bool) if self.base_drifts is None else self.base_drifts
         if j is None:
             noise = float(loud[i])
             row = _Row(
@@ -285,31 +286,31 @@ class _Measured:
                 multipath=1.0,
                 air=bend,
                 air_drift=bend,
-                base=float(kept[i]),
-                drift_known=bool(told[i]),
             )
         else:
             bands = [i, j]
             f1, f2 = s.frequency[bands] ** 2
             mean = np.array([0.5, 0.5])
-            free = mean if self.differential else np.array([f1, -f2]) / (f1 - f2)
+            free = mean if self.base is not None else np.array([f1, -f2]) / (f1 - f2)
             row = _Row(
                 code=float(free @ s.code[bands]),
                 rate=float(mean @ s.rate[bands]),
                 code_noise=float(np.linalg.norm(free * loud[bands])),
                 rate_noise=float(np.linalg.norm(mean * loud[bands])),
                 multipath=float(np.linalg.norm(free)),
-                air=float(mean @ s.bend[bands]) if self.differential else 0.0,
+                air=float(mean @ s.bend[bands]) if self.base is not None else 0.0,
                 air_drift=float(mean @ s.bend[bands]),
-                base=float(np.linalg.norm(mean * kept[bands])),
-                drift_known=bool(told[bands].all()),
             )
+        if self.base is not None:
+            used = [i] if j is None else [i, j]
+            told = np.isfinite(self.base.rate[used]).all()
+            row = replace(row, base_s=float(self.base.over_s[used].mean()), drift_known=bool(told))
         if self.arcs[i] < 0:
             return row
         first = replace(row, carrier=float(s.carrier[i]), carrier_noise=float(loud[i]))
-        if self.base_arcs is not None:
+        if self.base is not None:
             return replace(
-                first, air_drift=0.0, drift_known=True, arc=f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base_arcs[i]}"
+                first, air_drift=0.0, drift_known=True, arc=f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base.arc[i]}"
             )
         if j is None or self.arcs[j] < 0:
             return replace(first, air_drift=bend, arc=f"{name}/{self.arcs[i]}")

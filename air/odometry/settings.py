@@ -58,7 +58,8 @@ class WindowSettings:
 
     A frame becomes a keyframe once points moved by `parallax_deg` beyond what turning does since the last one, fewer
     than `overlap` of them are left, or after `longest_s`, and every `blind_s` while nothing is seen. A point needs
-    `min_angle_deg` between its rays. Observations beyond `max_residual` sigmas are outliers. Up to `anchored` points
+    `min_angle_deg` between its rays. Observations that miss by more than `max_residual_px` are outliers. `pixel_sigma`
+    is larger than their scatter, as what a track drifts stays with it from frame to frame. Up to `anchored` points
     outlive the keyframes that saw them.
     """
 
@@ -67,9 +68,9 @@ class WindowSettings:
     overlap: Annotated[float, Range(0.0, 1.0)] = 0.6
     longest_s: Annotated[float, Range(0.1, 100.0)] = 3.0
     blind_s: Annotated[float, Range(0.1, 100.0)] = 0.9
-    pixel_sigma: Annotated[float, Range(0.05, 10.0)] = 1.0
+    pixel_sigma: Annotated[float, Range(0.05, 10.0)] = 2.0
     min_angle_deg: Annotated[float, Range(0.05, 45.0)] = 1.0
-    max_residual: Annotated[float, Range(1.0, 100.0)] = 4.0
+    max_residual_px: Annotated[float, Range(0.1, 100.0)] = 4.0
     anchored: Annotated[int, Range(0, 200)] = 30
     iterations: Annotated[int, Range(1, 50)] = 4
 

@@ -160,7 +160,7 @@ class Window:
 
     def _locate(self) -> None:
         s, candidates = self._settings, np.setdiff1d(self.frames[-1].seen.ids, self._ids())
-        limit = s.max_residual * s.pixel_sigma
+        limit = s.max_residual_px
         found = locate(self._views(), candidates, self._focal, np.radians(s.min_angle_deg), limit)
         for i, p_world in found.items():
             self.values.insert(L(i), p_world)
@@ -298,7 +298,7 @@ class Window:
         ids = self._ids()
         p_world = np.array([self.values.atPoint3(L(i)) for i in ids.tolist()]).reshape(-1, 3)
         missed = misses(self._views(), ids, p_world, self._focal)
-        far = ~(missed.error <= self._settings.max_residual * self._settings.pixel_sigma)
+        far = ~(missed.error <= self._settings.max_residual_px)
         for v in set(missed.view[far].tolist()):
             self.frames[v].seen = self.frames[v].seen.without(missed.id[far & (missed.view == v)])
         self._drop_lonely()
