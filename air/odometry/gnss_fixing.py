@@ -12,8 +12,8 @@ import numpy as np
 
 from air.gnss.integers import find_integers
 from air.gnss.signals import LIGHT, PRIMARY, frequency
+from air.odometry.gnss_bands import DIFFERENTIAL
 from air.odometry.gnss_biases import BiasNode, Kind
-from air.odometry.gnss_preprocessing import DIFFERENTIAL
 from air.odometry.quadratic import Quadratic
 from common.arrays import F64
 

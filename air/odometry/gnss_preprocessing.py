@@ -7,6 +7,7 @@ Shen, GVINS (2022), section IV; Misra and Enge, Global Positioning System, 5.7.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,8 @@ from air.gnss.ephemerides import HeldEphemerides
 from air.gnss.gnss_time import SECOND_NS
 from air.gnss.positioning import PointPosition, Refused, find_position
 from air.gnss.settings import PositioningSettings
-from air.odometry.gnss_base import BaseStation, Differences
+from air.odometry.gnss_bands import DIFFERENTIAL, Measured, Row, loudness
+from air.odometry.gnss_base import BaseStation
 from air.odometry.gnss_carrier import CarrierLocks
 from air.odometry.gnss_corrections import Signals, correct
 from air.odometry.gnss_settings import GnssSettings
@@ -23,16 +25,12 @@ from common.arrays import F64, I64, Bool
 from common.measurements import GnssEpoch
 
 _LOW = np.radians(20.0)
-_NOMINAL_CN0 = 45.0
 _GLONASS = 1.5
 _ORBIT = {"E": 0.4, "C": 1.7, "R": 3.0}
 """Orbit and clock as broadcast, in units of those of GPS: O. Montenbruck, P. Steigenberger, A. Hauschild, Multi-GNSS
 signal-in-space range error assessment (2018), table 3."""
 _UNTOLD = 3.0
 """Least sigma of a satellite's clock, m, where nobody tells by how much its signals are late."""
-_LEAST = 0.7
-_MIN_DIFFERENCES = 5
-DIFFERENTIAL = "-base"
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +157,7 @@ class GnssPreprocessor:
         s, noise = self._settings.selection, self._settings.noise
         known_rate = signals.sigma_rate(epoch) <= s.max_sigma_rate
         signals = replace(signals, rate=np.where(known_rate, signals.rate, np.nan))
-        measured = _Measured(signals, arcs, _loudness(epoch.cn0[signals.row]))
+        measured = Measured(signals, arcs, loudness(epoch.cn0[signals.row]))
         measured, usable = measured.minus(self.base.differences(epoch.t_ns / SECOND_NS, signals), usable)
         second = {name: i for i, name in enumerate(signals.satellites) if not signals.first[i] and usable[i]}
         first = [i for i in range(len(signals.satellites)) if signals.first[i] and usable[i]]
@@ -220,107 +218,8 @@ class GnssPreprocessor:
         return replace(clean, code=np.where(wild, np.nan, clean.code))
 
 
-@dataclass(frozen=True)
-class _Row:
-    """The bands of a satellite as one: `code`, `carrier` m and `rate` m/s, and what spoils these in units of a single
-    signal in the zenith. `air` is by how much the ionosphere is in the code, `air_drift` in Doppler and carrier; a
-    base station has smoothed its code for `base_s`, and `drift_known` says whether it has told the drift too."""
-
-    code: float
-    rate: float
-    code_noise: float
-    rate_noise: float
-    multipath: float
-    air: float
-    carrier: float = np.nan
-    carrier_noise: float = np.nan
-    air_drift: float = 1.0
-    base_s: float = 0.0
-    drift_known: bool = False
-    arc: str = ""
-
-
-def _of(rows: list[_Row], name: str) -> F64:
+def _of(rows: Sequence[Row], name: str) -> F64:
     return np.array([getattr(row, name) for row in rows], float)
-
-
-@dataclass(frozen=True, eq=False)
-class _Measured:
-    """Signals with their arcs (M,) and how loud they are: sigma (M,) in units of that at 45 dBHz; and what was taken
-    off them, if they are differences to a base station."""
-
-    signals: Signals
-    arcs: I64
-    sigma: F64
-    base: Differences | None = None
-
-    def minus(self, base: Differences, usable: Bool) -> tuple[_Measured, Bool]:
-        """Differences to a base station, where it saw the same signals; all as they are when it saw too few of them."""
-        both = usable & np.isfinite(base.code)
-        if np.sum(both & self.signals.first) < _MIN_DIFFERENCES:
-            return self, usable
-        signals = replace(
-            self.signals,
-            code=self.signals.code - base.code,
-            carrier=self.signals.carrier - base.carrier,
-            rate=self.signals.rate - np.nan_to_num(base.rate),
-        )
-        arcs = np.where(base.arc >= 0, self.arcs, -1)
-        return _Measured(signals, arcs, self.sigma, base), both
-
-    def of(self, i: int, j: int | None) -> _Row:
-        """The signal `i` of the first band and, where there is one, `j` of the second as one row.
-
-        The ionosphere is taken out where both bands are there, by the combination that is free of it; from differences
-        to a base station it is gone already.
-        """
-        s, name, loud = self.signals, self.signals.satellites[i], self.sigma
-        bend = float(s.bend[i])
-        if j is None:
-            noise = float(loud[i])
-            row = _Row(
-                code=float(s.code[i]),
-                rate=float(s.rate[i]),
-                code_noise=noise,
-                rate_noise=noise,
-                multipath=1.0,
-                air=bend,
-                air_drift=bend,
-            )
-        else:
-            bands = [i, j]
-            f1, f2 = s.frequency[bands] ** 2
-            mean = np.array([0.5, 0.5])
-            free = mean if self.base is not None else np.array([f1, -f2]) / (f1 - f2)
-            row = _Row(
-                code=float(free @ s.code[bands]),
-                rate=float(mean @ s.rate[bands]),
-                code_noise=float(np.linalg.norm(free * loud[bands])),
-                rate_noise=float(np.linalg.norm(mean * loud[bands])),
-                multipath=float(np.linalg.norm(free)),
-                air=float(mean @ s.bend[bands]) if self.base is not None else 0.0,
-                air_drift=float(mean @ s.bend[bands]),
-            )
-        if self.base is not None:
-            used = [i] if j is None else [i, j]
-            told = np.isfinite(self.base.rate[used]).all()
-            row = replace(row, base_s=float(self.base.over_s[used].mean()), drift_known=bool(told))
-        if self.arcs[i] < 0:
-            return row
-        first = replace(row, carrier=float(s.carrier[i]), carrier_noise=float(loud[i]))
-        if self.base is not None:
-            return replace(
-                first, air_drift=0.0, drift_known=True, arc=f"{name}{DIFFERENTIAL}/{self.arcs[i]}-{self.base.arc[i]}"
-            )
-        if j is None or self.arcs[j] < 0:
-            return replace(first, air_drift=bend, arc=f"{name}/{self.arcs[i]}")
-        return replace(
-            row,
-            carrier=float(free @ s.carrier[bands]),
-            carrier_noise=float(np.linalg.norm(free * loud[bands])),
-            air_drift=0.0,
-            arc=f"{name}/{self.arcs[i]}+{self.arcs[j]}",
-        )
 
 
 def _growth(elevation: F64) -> F64:
@@ -332,9 +231,3 @@ def _kept_by_mean(times: F64) -> F64:
     """Sigma (M,) of the mean of a Gauss–Markov process of unit sigma over so many of its correlation times."""
     t = np.maximum(times, 1e-3)
     return np.asarray(np.sqrt(2.0 / t * (1.0 - (1.0 - np.exp(-t)) / t)))
-
-
-def _loudness(cn0: F64) -> F64:
-    """Sigma (M,) of white noise in units of that at 45 dBHz."""
-    known = np.clip(np.where(np.isnan(cn0), _NOMINAL_CN0, cn0), 0.0, 60.0)
-    return np.maximum(10 ** ((_NOMINAL_CN0 - known) / 20), _LEAST)
