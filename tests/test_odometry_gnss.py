@@ -13,6 +13,7 @@ from odometry_scene import CAMERA, T_BODY_CAM, Scene
 from air.gnss.gnss_time import SECOND_NS
 from air.odometry.estimator import Estimate, Estimator, blind_frame
 from air.odometry.gnss_settings import GnssSettings
+from air.odometry.mounting import LENS, MountingSettings
 from air.odometry.settings import OdometrySettings
 from air.odometry.tracker import TrackedFrame
 from air.sources.simulated.gnss.gnss_options import GnssOptions
@@ -41,11 +42,17 @@ class Outcome:
     """Estimates in the world, and where they are off."""
 
     def __init__(
-        self, flown: tuple[GnssFlight, list[object]], change: Change = lambda _, m: m, base: F64 | None = None
+        self,
+        flown: tuple[GnssFlight, list[object]],
+        change: Change = lambda _, m: m,
+        base: F64 | None = None,
+        focal: float = CAMERA.fx,
+        mounting: MountingSettings | None = None,
     ) -> None:
         truth, messages = flown
         gnss = GnssSettings(p_body_antenna=truth.p_body_antenna)
-        self.estimator = Estimator(CAMERA.fx, T_BODY_CAM, OdometrySettings(gnss=gnss), base=base)
+        settings = OdometrySettings(gnss=gnss, mounting=mounting or MountingSettings())
+        self.estimator = Estimator(focal, T_BODY_CAM, settings, base=base)
         changed = (change((getattr(m, "t_ns", START_NS) - START_NS) / SECOND_NS, m) for m in messages)
         told = estimates(self.estimator, (m for m in changed if m is not None))
         self.first_s = self.at_s(told[0])
@@ -141,6 +148,27 @@ def test_wrong_satellites_do_not_move_the_aircraft(
     found = Outcome(flown, late)
     rmse = [float(np.sqrt(np.mean(np.sum(one.left**2, axis=1)))) for one in (found, undisturbed)]
     assert rmse[0] < 1.5 * rmse[1] + 0.02
+
+
+def test_a_lens_that_is_not_as_calibrated_is_learnt(flown: tuple[GnssFlight, list[object]]) -> None:
+    """Two or three pixels, where the calibration claims two."""
+    wrong = np.array([2.0, -3.0, 2.0])
+    calibrated = replace(CAMERA, fx=CAMERA.fx - wrong[0], fy=CAMERA.fy - wrong[0])
+    calibrated = replace(calibrated, cx=CAMERA.cx - wrong[1], cy=CAMERA.cy - wrong[2])
+
+    def seen(_: float, m: object) -> object:
+        if not isinstance(m, TrackedFrame) or not len(m.uv):
+            return m
+        rays = calibrated.rays(m.uv)
+        return replace(m, rays=rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    out = Outcome(flown, seen, None, calibrated.fx, MountingSettings(focal_px=2.0, centre_px=2.0))
+    mounted = out.estimator.mounted
+    sigma = np.sqrt(np.diag(mounted.covariance)[LENS])
+    assert mounted.learnt[LENS][1:].all()
+    assert (np.abs(mounted.u[LENS] - wrong)[1:] < 0.5 * np.abs(wrong[1:])).all()
+    assert (np.abs(mounted.u[LENS] - wrong)[mounted.learnt[LENS]] < 4.0 * sigma[mounted.learnt[LENS]]).all()
+    assert np.linalg.norm(out.left, axis=1).max() < 0.15
 
 
 def test_a_base_station_places_the_aircraft_to_centimetres() -> None:

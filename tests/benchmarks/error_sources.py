@@ -27,6 +27,7 @@ SENSED = {
 
 SEEN = {
     "all of the camera and its lens": "&camera=perfect",
+    "how far the lens is from its calibration": "&camera.focal_px=0&camera.centre_px=0",
     "where camera and antenna sit": "&extrinsics=perfect",
     "clocks and ways of the messages": "&clock=perfect",
 }
