@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -105,7 +106,7 @@ class NormalEquations:
     def add(self, keys: Iterable[int], G: F64, g: F64) -> None:
         """Add a function of some of the variables."""
         columns = self.columns(keys)
-        self.G[np.ix_(columns, columns)] += G
+        _add(self.G, columns, G)
         self.g[columns] += g
 
     def columns(self, keys: Iterable[int]) -> I64:
@@ -128,7 +129,7 @@ class NormalEquations:
             others = np.flatnonzero(left & (G[own] != 0.0).any(axis=0))
             G_others = G[np.ix_(own, others)]
             way = _solve(G[np.ix_(own, own)], np.column_stack([G_others, g[own]]))
-            G[np.ix_(others, others)] -= G_others.T @ way[:, :-1]
+            _add(G, others, -G_others.T @ way[:, :-1])
             g[others] -= G_others.T @ way[:, -1]
             ways.append((own, others, way))
         rest, columns = np.flatnonzero(left), self.columns(covariance_of)
@@ -237,6 +238,15 @@ def by_world(key: int, now: Variable, origin: F64) -> F64:
     elif key >> 56 == _VELOCITY:
         out[:, 3] = np.cross(up, now)
     return out
+
+
+def _add(G: F64, columns: I64, part: F64) -> None:
+    """Add a part to some rows and columns, stretch by stretch of neighbours: many times faster than one by one."""
+    begins = [0, *(np.flatnonzero(np.diff(columns) != 1) + 1).tolist(), len(columns)]
+    runs = [(slice(a, b), slice(columns[a], columns[b - 1] + 1)) for a, b in pairwise(begins) if a < b]
+    for mine, rows in runs:
+        for others, across in runs:
+            G[rows, across] += part[mine, others]
 
 
 def _solve(G: F64, right: F64) -> F64:
