@@ -10,9 +10,11 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from air.odometry.mounting import COLUMNS, MOUNTING, Mounted, Mounting, MountingSettings
+from air.odometry.odometry import with_lens
 from air.odometry.quadratic import NormalEquations, dimension
 from air.odometry.sightings import HUBER, Lens, Seen, Sightings
 from common.arrays import F64
+from common.camera import CameraModel
 from common.se3 import SE3, rotation_vector_to_matrix
 
 FOCAL, SIGMA = 600.0, 1.5
@@ -151,6 +153,14 @@ def test_points_of_a_corrected_lens_are_where_a_calibrated_one_would_show_them()
     seen = Seen(np.arange(2), (640.0 + lens[0]) * p + lens[1:] - delay_s * rate, rate)
     corrected = seen.corrected(Mounting(delay_s=delay_s, lens=lens), 640.0)
     np.testing.assert_allclose(corrected, 640.0 * p, atol=1e-9)
+
+
+def test_the_corrected_camera_shows_points_where_the_calibrated_one_with_corrections_does() -> None:
+    camera, lens = CameraModel(1280, 720, 640.0, 650.0, 639.5, 359.5), np.array([5.0, -2.0, 1.5])
+    rays = np.array([[0.3, -0.2, 1.0], [-0.6, 0.4, 1.0]])
+    told = camera.rays(with_lens(camera, lens).project(rays))
+    seen = Seen(np.arange(2), camera.fx * told[:, :2] / told[:, 2:], np.zeros((2, 2)))
+    np.testing.assert_allclose(seen.corrected(Mounting(lens=lens), camera.fx), camera.fx * rays[:, :2], atol=1e-6)
 
 
 def test_columns_that_are_held_stay_and_the_others_are_solved_with_them_held() -> None:

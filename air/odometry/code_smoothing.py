@@ -48,7 +48,7 @@ class CodeSmoother:
         means = {}
         for key, i in rows.items():
             j = rows.get((key[0], not key[1]), -1)
-            carrier = signals.carrier[i] + (_divergence(signals, i, j) if j >= 0 else 0.0)
+            carrier = signals.carrier[i] + (divergence(signals, i, j) if j >= 0 else 0.0)
             # Carriers keep to one model of the ionosphere, codes take the newest.
             measured = signals.code[i] + signals.renewed[i]
             pair = int(arcs[i]), int(arcs[j]) if j >= 0 else -1
@@ -75,7 +75,7 @@ def _longest(arcs: tuple[int, int]) -> float:
     return LONGEST_S if arcs[1] >= 0 else LONGEST_ALONE_S
 
 
-def _divergence(signals: Signals, i: int, j: int) -> float:
+def divergence(signals: Signals, i: int, j: int) -> float:
     """By how much the ionosphere has moved code `i` away from its carrier, m, as both carriers show, but a constant."""
     between = signals.carrier[i] - signals.carrier[j]
     return float(2.0 * signals.bend[i] / (signals.bend[j] - signals.bend[i]) * between)

@@ -1,7 +1,7 @@
 """A base station: what the measurements of a known place tell of the errors that a rover nearby has as well.
 
-Its own noise and echoes would come along, were its codes not smoothed by its carriers.
-Source: Misra and Enge, Global Positioning System, 5.6 (differential corrections of code and carrier).
+Its own noise and echoes would come along, were its codes not smoothed by its carriers. Source: Misra and Enge, Global
+Positioning System, 5.6 (differential corrections of code and carrier).
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class GnssNoise:
     system_walk: Sigma = 0.01
     differential: Annotated[float, Range(0.0, 1.0)] = 0.02
     base: Sigma = 0.3
-    base_s: Seconds = 60.0
+    base_s: Annotated[float, Range(1.0, 1e5)] = 60.0
     robust: Annotated[float, Range(1.0, 100.0)] = 4.0
 
 

@@ -275,10 +275,11 @@ class Odometry:
 
 
 def with_lens(camera: CameraModel, lens: F64) -> CameraModel:
-    """The camera with corrections (3,) px of its focal length and principal point."""
+    """The camera with corrections (3,), in px of its horizontal focal length, of that and of its principal point."""
     focal, cx, cy = lens.tolist()
-    fy = camera.fy * (1.0 + focal / camera.fx)
-    return replace(camera, fx=camera.fx + focal, fy=fy, cx=camera.cx + cx, cy=camera.cy + cy)
+    along_y = camera.fy / camera.fx
+    fx, fy = camera.fx + focal, camera.fy + focal * along_y
+    return replace(camera, fx=fx, fy=fy, cx=camera.cx + cx, cy=camera.cy + cy * along_y)
 
 
 def decoded(frame: CameraFrame) -> U8 | None:

@@ -30,6 +30,7 @@ from air.gnss.ephemerides import Ephemerides
 from air.gnss.positioning import PointPosition, find_position
 from air.gnss.settings import PositioningSettings
 from air.gnss.signals import LIGHT, PRIMARY, SECONDARY, frequency, preference
+from air.odometry.code_smoothing import divergence
 from air.odometry.gnss_carrier import CarrierLocks
 from air.odometry.gnss_corrections import Signals
 from air.odometry.gnss_settings import GnssSelection
@@ -111,13 +112,12 @@ def arcs_of(source):
             elevations.update(zip(fix.used, fix.elevation.tolist(), strict=True))
         signals = uncorrected(message)
         arcs = locks.step(t_s, signals, message.lock_s[signals.row])
-        rows = {key: i for i, key in enumerate(zip(signals.satellites, signals.first.tolist(), strict=True))}
+        rows = {key: i for i, key in enumerate(signals.keys)}
         for i in np.flatnonzero(arcs >= 0).tolist():
             satellite, row = signals.satellites[i], signals.row[i]
             other = rows.get((satellite, not signals.first[i]), i)
             two = other != i and arcs[other] >= 0
-            share = 2 * signals.bend[i] / (signals.bend[other] - signals.bend[i]) if two else 0.0
-            split = share * (signals.carrier[i] - signals.carrier[other]) if two else 0.0
+            split = divergence(signals, i, other) if two else 0.0
             error = signals.code[i] - signals.carrier[i] - split
             kind = f"{satellite[0]} {message.signals[row]}, {'two bands' if two else 'one band'}"
             some = held[kind, satellite, int(arcs[i]), int(arcs[other])]
@@ -154,6 +154,7 @@ def uncorrected(epoch):
         elevation=unknown,
         told=np.ones(len(row), bool),
         issue=np.zeros(len(row), np.int64),
+        renewed=np.zeros(len(row)),
     )
 
 
